@@ -8,7 +8,6 @@ schema, statistics and video, and then moves them into place, so that the datase
 
 import contextlib
 import logging
-import os
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,7 +28,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot_playbyear.datasets.episode_files import stage_episode
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
 from lerobot_playbyear.datasets.features import Features, check_features, check_frame, differences, is_depth
-from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, list_files
+from lerobot_playbyear.datasets.files import INFO_PATH, list_files
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.info import check_parts, nothing_in
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, finish_journal, lock_dataset, publish, remove_staged
@@ -96,30 +95,29 @@ class DurableWriter:
         self.root = Path(root)
         self.features = features
         self._encoder = rgb_encoder or rgb_encoder_defaults()
-        self._lock: FolderLock | None = None
         self._pool = ThreadPoolExecutor(_THREADS)
         self._forget_episode()
         try:
             check_root(self.root, resume=resume)
-            self._lock = lock_dataset(self.root)
-            finish_journal(self.root)
-            if has_dataset(self.root):
-                check_undamaged(self.root)
-                self._info = load_info(self.root)
-                _check_compatible(self.root, self._info, fps, features, robot_type)
-            else:
-                self._info = _new_info(fps, features, robot_type)
-            if remove_staged(self.root):
-                logger.warning(
-                    f"{self.root}: an episode that had not been saved was removed; the {self.num_episodes} episodes "
-                    "before it are complete."
-                )
-        except BaseException as error:
-            if self._lock is not None:
-                self._lock.release()
-            if isinstance(error, OSError) and not isinstance(error, FileExistsError):
-                raise DatasetWriteError(f"Cannot write to {self.root}: {error.strerror or error}.") from error
+            with contextlib.ExitStack() as stack:
+                stack.push(lock_dataset(self.root))
+                finish_journal(self.root)
+                if has_dataset(self.root):
+                    check_undamaged(self.root)
+                    self._info = load_info(self.root)
+                    _check_compatible(self.root, self._info, fps, features, robot_type)
+                else:
+                    self._info = _new_info(fps, features, robot_type)
+                if remove_staged(self.root):
+                    logger.warning(
+                        f"{self.root}: an episode that had not been saved was removed; the {self.num_episodes} episodes "
+                        "before it are complete."
+                    )
+                self._lock = stack.pop_all()
+        except FileExistsError:
             raise
+        except OSError as error:
+            raise DatasetWriteError(f"Cannot write to {self.root}: {error.strerror or error}.") from error
 
     @property
     def num_episodes(self) -> int:
@@ -188,16 +186,13 @@ class DurableWriter:
 
     def close(self) -> None:
         """Drops an episode in progress. Safe to call twice."""
-        if self._lock is None:
-            return
         if self._is_complete:
             with contextlib.suppress(OSError):  # the next writer tries again
                 finish_journal(self.root)
                 remove_staged(self.root)
         self._forget_episode()
         self._pool.shutdown(cancel_futures=True)
-        self._lock.release()
-        self._lock = None
+        self._lock.close()
 
     def __enter__(self) -> "DurableWriter":
         return self
@@ -307,10 +302,9 @@ def has_dataset(root: Path) -> bool:
         OSError: It, or a folder in it, cannot be listed: that says nothing of what it holds.
     """
     try:
-        os.listdir(root)
+        return any(list_files(root, name) for name in (INFO_PATH, "data/chunk-*/file-*", "meta/episodes/*/*"))
     except FileNotFoundError:
         return False
-    return any(list_files(root, name) for name in (INFO_PATH, "data/chunk-*/file-*", "meta/episodes/*/*"))
 
 
 def check_undamaged(root: Path) -> None:

@@ -78,18 +78,6 @@ def is_listed(root: Path, name: str | Path) -> bool:
     return bool(list_files(root, glob.escape(Path(name).as_posix())))
 
 
-def read_listed(root: Path, name: str) -> bytes | None:
-    """A file's content; None where no folder lists it.
-
-    Raises:
-        OSError: It cannot be read now, or a folder on the way cannot be listed.
-    """
-    if not is_listed(root, name):
-        return None
-    with naming(root / name):
-        return (root / name).read_bytes()
-
-
 def parse_json(data: str | bytes) -> Any:
     """What JSON says.
 

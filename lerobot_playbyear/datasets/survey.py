@@ -4,7 +4,6 @@ The repair keeps what a survey calls whole, inspection reports what it finds, an
 damaged. That something cannot be read now is no finding but an OSError: it says nothing about the dataset.
 """
 
-import io
 import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from PIL import Image, UnidentifiedImageError
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, audio_keys, check_audio_features
-from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, naming
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
 from lerobot_playbyear.datasets.info import (
     INDEX_COLUMNS,
@@ -35,7 +34,6 @@ from lerobot_playbyear.datasets.parquet import (
     DataFile,
     ParquetDamageError,
     are_alike,
-    check_room,
     column_to_numpy,
     parsing,
     read_table,
@@ -472,10 +470,10 @@ def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], found: Se
             yield _wrong("rows", f"{said} {expected}", [episode.number])
             break
         expected += episode.frames.length
-    data = read_listed(root, STATS_PATH)
     try:
-        if data is not None:
-            parse_stats(data)
+        if is_listed(root, STATS_PATH):
+            with naming(root / STATS_PATH):
+                parse_stats((root / STATS_PATH).read_bytes())
         elif n_frames:
             yield _wrong("statistics", f"{STATS_PATH} is missing")
     except ValueError as error:
@@ -517,15 +515,12 @@ def unknown_task(number: int) -> str:
 
 def _tasks_in_table(root: Path) -> tuple[dict[int, str], str | None]:
     """The tasks' texts, and what is wrong with their table: LeRobot finds a task by its place."""
-    data = read_listed(root, TASKS_PATH)
-    if data is None:
+    path = root / TASKS_PATH
+    if not is_listed(root, TASKS_PATH):
         return {}, "is missing"
-    import pandas as pd
-
     try:
-        with parsing():
-            check_room(root / TASKS_PATH, pq.read_metadata(io.BytesIO(data)))
-            table = pd.read_parquet(io.BytesIO(data))  # as LeRobot does
+        with parsing(path):
+            table = read_table(path).to_pandas()  # as LeRobot does
         known = dict(zip(table["task_index"].astype(int).tolist(), table.index.astype(str), strict=True))
     except (ParquetDamageError, KeyError, ValueError, TypeError) as error:
         return {}, f"cannot be read ({error})"

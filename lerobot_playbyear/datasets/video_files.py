@@ -5,6 +5,7 @@ in `meta/episodes` is lost, follows from where those of the episode before it ar
 """
 
 import contextlib
+import functools
 import io
 import math
 from collections.abc import Mapping, Sequence
@@ -77,7 +78,8 @@ def find_places(
     Raises:
         OSError: A film cannot be read now.
     """
-    films = _Films(root, info, key)
+    look = functools.cache(functools.partial(_look, root))
+    film = functools.partial(film_path, root, info, key)
     found: list[Place | str | None] = []
     before: Place | None = Place(0, 0, 0.0, 0.0)
     for length, own in zip(lengths, said, strict=True):
@@ -85,62 +87,49 @@ def find_places(
             before = own
             found.append(own)
             continue
+        place, problem = own, "nothing says where"
         is_right = own is not None and abs((own.end - own.start) * info["fps"] - length) <= 1
-        place = own if is_right else films.after(before, length)
-        problem = films.problem(place, length, closely=thorough or not is_right) if place else "nothing says where"
+        if not is_right:
+            place = _place_after(before, look(film(before), True), length, info) if before else None
+        if place:
+            problem = _problem(look(film(place), thorough or not is_right), place, length, info["fps"])
+            problem = problem and f"{film(place).relative_to(root)} {problem}"
         found.append(problem or place)
         before = None if problem else place
     return found
 
 
-class _Films:
-    """The films of one camera. What was found out about one is kept, and not read again."""
+def _place_after(before: Place, times: np.ndarray | str | None, length: int, info: Info) -> Place:
+    """Where the next episode's pictures are: behind the last ones, or in the next film where those end it."""
+    chunk, file, start = before.chunk, before.file, before.end
+    if start and not (isinstance(times, np.ndarray) and len(times) and times[-1] >= start - TOLERANCE_S):
+        chunk, file = (chunk, file + 1) if file + 1 < info["chunks_size"] else (chunk + 1, 0)
+        start = 0.0
+    return Place(chunk, file, start, start + length / info["fps"])
 
-    def __init__(self, root: Path, info: Info, key: str) -> None:
-        self._root, self._info, self._key = root, info, key
-        self._found: dict[tuple[Path, bool], np.ndarray | str] = {}
 
-    def after(self, before: Place | None, length: int) -> Place | None:
-        """Where the next episode's pictures are: behind the last ones, or in the next film where those end it."""
-        if before is None:
-            return None
-        chunk, file, start = before.chunk, before.file, before.end
-        times = self._times(film_path(self._root, self._info, self._key, before))
-        if start and (isinstance(times, str) or len(times) == 0 or times[-1] < start - TOLERANCE_S):
-            chunk, file = (chunk, file + 1) if file + 1 < self._info["chunks_size"] else (chunk + 1, 0)
-            start = 0.0
-        return Place(chunk, file, start, start + length / self._info["fps"])
+def _problem(times: np.ndarray | str | None, place: Place, length: int, fps: float) -> str:
+    """What is wrong with the film of a place, or that it lacks pictures of these frames; empty where nothing is."""
+    if times is None or isinstance(times, str):
+        return times or ""
+    wanted = place.start + np.arange(length) / fps
+    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+    near = times.take([after - 1, after], mode="clip") if len(times) else np.full((2, 1), np.inf)
+    is_there = np.abs(near - wanted).min(axis=0).max() < TOLERANCE_S + np.spacing(np.float32(place.end))
+    return "" if is_there else "lacks some of the pictures"
 
-    def problem(self, place: Place, length: int, closely: bool) -> str | None:
-        """What is wrong with the film of a place, or that it lacks pictures of these frames."""
-        path = film_path(self._root, self._info, self._key, place)
-        name, times = path.relative_to(self._root), self._times(path, closely)
-        if isinstance(times, str):
-            return f"{name} {times}"
-        if closely:
-            wanted = place.start + np.arange(length) / self._info["fps"]
-            after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
-            near = times.take([after - 1, after], mode="clip") if len(times) else np.full((2, 1), np.inf)
-            if np.abs(near - wanted).min(axis=0).max() >= TOLERANCE_S + np.spacing(np.float32(place.end)):
-                return f"{name} lacks some of the pictures"
-        return None
 
-    def _times(self, path: Path, closely: bool = True) -> np.ndarray | str:
-        """When a film's pictures are shown, or what is wrong with it; none of them where it is not looked at closely."""
-        if (path, closely) not in self._found:
-            self._found[path, closely] = self._look(path, closely)
-        return self._found[path, closely]
-
-    def _look(self, path: Path, closely: bool) -> np.ndarray | str:
-        with naming(path):
-            if not is_listed(self._root, path.relative_to(self._root)):
-                return "is missing"
-            if _is_cut_off(path):
-                return "is cut off"
-            try:
-                return picture_times(path) if closely else np.empty(0)
-            except av.FFmpegError as error:
-                return f"is not a video that can be read: {error}"
+def _look(root: Path, path: Path, closely: bool) -> np.ndarray | str | None:
+    """When a film's pictures are shown, or what is wrong with it; None of one that is whole, unless it is looked at closely."""
+    with naming(path):
+        if not is_listed(root, path.relative_to(root)):
+            return "is missing"
+        if _is_cut_off(path):
+            return "is cut off"
+        try:
+            return picture_times(path) if closely else None
+        except av.FFmpegError as error:
+            return f"is not a video that can be read: {error}"
 
 
 def picture_times(path: Path) -> np.ndarray:

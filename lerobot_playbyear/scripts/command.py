@@ -16,7 +16,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from lerobot_playbyear.datasets.errors import printable
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, errors_of_input, printable
 from lerobot_playbyear.training.command_line import given_options
 
 HELP = Path(__file__).with_name("help")
@@ -51,8 +51,6 @@ def command(
                 sys.argv[i] = f"--{name}={sys.argv[i]}"
             answer_at_once(f"playbyear-{work.__name__.replace('_', '-')}")
             from draccus.utils import ParsingError
-
-            from lerobot_playbyear.datasets.errors import PlaybyearError
 
             said = (OSError, ValueError) if is_file_work else ()
             try:
@@ -94,8 +92,6 @@ def own_temporary_folder() -> Iterator[None]:
     Raises:
         InputError: Nothing can be written there.
     """
-    from lerobot_playbyear.datasets.errors import InputError
-
     before = tempfile.tempdir
     try:
         system = tempfile.gettempdir()
@@ -242,7 +238,6 @@ def run_alone[Result](work: Callable[[Any], Result], parse: Callable[[type], Any
     """
     import draccus
 
-    from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.hub.client import be_patient
 
     be_patient()
@@ -285,7 +280,6 @@ def _check_saved_options(args: list[str]) -> None:
     Raises:
         InputError: One of them is damaged.
     """
-    from lerobot_playbyear.datasets.errors import InputError
     from lerobot_playbyear.datasets.files import parse_json
 
     given, _ = given_options(args)

@@ -1,9 +1,11 @@
 """The commands: what each imports when it is called, and what it does. Their help is in `help/`."""
 
-import logging
 import sys
+from collections.abc import Callable
+from pkgutil import resolve_name
+from typing import Any
 
-from lerobot_playbyear.datasets.errors import printable
+from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.scripts.command import command, run_alone, run_with_lerobot
 
 
@@ -38,7 +40,6 @@ def dagger() -> None:
 
 @command(is_file_work=True)
 def video() -> None:
-    logging.basicConfig(level=logging.WARNING)
     from lerobot_playbyear.film.rollout_film import film
 
     run_with_lerobot(film)
@@ -46,8 +47,6 @@ def video() -> None:
 
 @command(flag="--json")
 def inspect() -> None:
-    logging.basicConfig(level=logging.WARNING)
-    from lerobot_playbyear.datasets.errors import InputError
     from lerobot_playbyear.datasets.findings import worst
     from lerobot_playbyear.inspection.inspect import inspect
 
@@ -73,37 +72,22 @@ def repair() -> None:
     sys.exit(0 if report.is_done else 1)
 
 
-@command("Interrupted. The same command goes on.", words=("action", "folder"))
-def reproduce() -> None:
-    from lerobot_playbyear.reproduce.run import reproduce
+def _work_of(where: str, **options: Any) -> Callable[[], None]:
+    """A command that does the work of a function, `module:name`, and nothing else; it has the function's name."""
 
-    run_alone(reproduce)
+    def work() -> None:
+        run_alone(resolve_name(f"lerobot_playbyear.{where}"))
 
-
-@command(is_file_work=True)
-def attach_audio() -> None:
-    from lerobot_playbyear.audio.attach_audio import attach_audio
-
-    run_alone(attach_audio)
+    work.__name__ = where.rpartition(":")[2]
+    return command(**options)(work)
 
 
-@command(is_file_work=True)
-def attach_spectrogram() -> None:
-    from lerobot_playbyear.audio.attach_spectrogram import attach_spectrogram
-
-    run_alone(attach_spectrogram)
-
-
-@command(is_file_work=True)
-def find_microphones() -> None:
-    from lerobot_playbyear.microphones.finding import find_microphones
-
-    run_alone(find_microphones)
-
-
-@command("Interrupted. The same command goes on; what has arrived is not sent again.")
-def push() -> None:
-    logging.basicConfig(level=logging.WARNING)
-    from lerobot_playbyear.hub.push import push
-
-    run_alone(push)
+attach_audio = _work_of("audio.attach_audio:attach_audio", is_file_work=True)
+attach_spectrogram = _work_of("audio.attach_spectrogram:attach_spectrogram", is_file_work=True)
+find_microphones = _work_of("microphones.finding:find_microphones", is_file_work=True)
+push = _work_of(
+    "hub.push:push", interrupted="Interrupted. The same command goes on; what has arrived is not sent again."
+)
+reproduce = _work_of(
+    "reproduce.run:reproduce", interrupted="Interrupted. The same command goes on.", words=("action", "folder")
+)
