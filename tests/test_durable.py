@@ -177,7 +177,7 @@ def test_a_crash_while_an_episode_is_moved_into_place_loses_nothing(tmp_path, mo
     with pytest.raises(PowerCut):
         write_episode(target, 1)
     monkeypatch.undo()
-    target._lock.release()
+    target._lock.close()
 
     crashed = load(root)
     assert not differences(crashed, {n: n for n in range(crashed.num_episodes)}, FEATURES)
@@ -394,7 +394,7 @@ def hold(root: Path, answers) -> None:
                 taken += 1
                 time.sleep(0.0005)
                 (root / "held").rmdir()
-            lock.release()
+            lock.close()
         time.sleep(random.uniform(0.001, 0.004))  # or all of them only ever stand in each other's way
     answers.put(doubled)
 

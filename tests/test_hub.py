@@ -283,7 +283,7 @@ def test_a_dataset_that_is_being_recorded_to_is_not_uploaded(dataset, here, film
     lock = lock_dataset(dataset)
     with pytest.raises(FolderLockedError, match="Another process is writing to"):
         push_dataset("tester/set", dataset, PushOptions(preview=film))
-    lock.release()
+    lock.close()
     assert not here.requests
     assert push_dataset("tester/set", dataset, PushOptions(preview=film)) == f"{here.url}/datasets/tester/set"
 

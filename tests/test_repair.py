@@ -374,7 +374,7 @@ def test_nothing_is_written_where_something_is_or_while_somebody_writes(copy):
     lock = lock_dataset(root)
     with pytest.raises(InputError, match="Another process"):
         repair_dataset(root)
-    lock.release()
+    lock.close()
     (root.parent / "dataset_repaired").mkdir()
     with pytest.raises(InputError, match=r"--output=.*is there already"):
         repair_dataset(root)

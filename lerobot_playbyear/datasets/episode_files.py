@@ -136,18 +136,13 @@ def _stage_data(root: Path, info: DatasetInfo, columns: Mapping[str, Any], last:
     """Writes an episode's frames, behind those of the last small file. Returns where."""
     schema = get_hf_features_from_features(info.features).arrow_schema
     arrays = [_arrow_column(columns[name], schema.field(name).type, info.features[name]) for name in schema.names]
-    tables = [pa.Table.from_arrays(arrays, schema=schema)]
     name, place = _place(root, info.data_path, last, "data", info.chunks_size)
+    before = []
     if last:
-        own = {key: last[key] for key in place}
-        before = info.data_path.format(chunk_index=last["data/chunk_index"], file_index=last["data/file_index"])
-        if _is_small(root / before, SMALL_DATA_BYTES):
-            try:
-                tables = [*_row_groups(root / before, schema), *tables]
-                name, place = Path(before), own
-            except (ParquetDamageError, pa.ArrowException) as error:
-                logger.warning("%s is not continued: %s.", root / before, error)
-    write_tables(root / STAGING / name, tables, schema)
+        own = info.data_path.format(chunk_index=last["data/chunk_index"], file_index=last["data/file_index"])
+        if before := _continued(root / own, SMALL_DATA_BYTES, schema):
+            name, place = Path(own), {key: last[key] for key in place}
+    write_tables(root / STAGING / name, [*before, pa.Table.from_arrays(arrays, schema=schema)], schema)
     return place
 
 
@@ -161,19 +156,22 @@ def _arrow_column(values: Any, kind: pa.DataType, feature: Mapping[str, Any]) ->
     return numpy_to_column(values, kind) if isinstance(values, np.ndarray) else pa.array(values, kind)
 
 
-def _row_groups(path: Path, schema: pa.Schema) -> list[pa.Table]:
-    """The row groups of a data file.
-
-    Raises:
-        ParquetDamageError: One of them is damaged, or the file has other columns.
-    """
-    file, tables = DataFile(path), []
-    if not file.schema.remove_metadata().equals(schema.remove_metadata()):
-        raise ParquetDamageError("its columns are of other types")
-    for _, table in file.row_groups():
-        if isinstance(table, ParquetDamageError):
-            raise table
-        tables.append(table.replace_schema_metadata(schema.metadata))
+def _continued(path: Path, limit: int, schema: pa.Schema) -> list[pa.Table]:
+    """The row groups of a small file, which is continued; none of one that is large, damaged or of other columns."""
+    if not path.is_file() or path.stat().st_size >= limit:
+        return []
+    tables = []
+    try:
+        file = DataFile(path)
+        if not file.schema.remove_metadata().equals(schema.remove_metadata()):
+            raise ParquetDamageError("its columns are of other types")
+        for _, table in file.row_groups():
+            if isinstance(table, ParquetDamageError):
+                raise table
+            tables.append(table.replace_schema_metadata(schema.metadata))
+    except (ParquetDamageError, pa.ArrowException) as error:
+        logger.warning("%s is not continued: %s.", path, error)
+        return []
     return tables
 
 
@@ -208,16 +206,8 @@ def _stage_row(root: Path, row: dict[str, Any], table: Path | None, last: Mappin
     """Puts the episode's row behind those of the last small table of episodes."""
     name, place = _place(root, DEFAULT_EPISODES_PATH, last, "meta/episodes", chunks_size)
     schema = None if table is None else pq.read_schema(table).remove_metadata()
-    before = []
-    if table is not None and _is_small(table, SMALL_TABLE_BYTES):
-        try:
-            before = [read_table(table).replace_schema_metadata(None)]
-            name, place = table.relative_to(root), {key: last[key] for key in place}
-        except ParquetDamageError as error:
-            logger.warning("%s is not continued: %s.", table, error)
+    before = [] if table is None else _continued(table, SMALL_TABLE_BYTES, schema)
+    if table is not None and before:
+        name, place = table.relative_to(root), {key: last[key] for key in place}
     rows = pa.Table.from_pylist([row | place], schema)  # what the schema lacks is left out
     write_rows(pa.concat_tables([*before, rows]).combine_chunks(), root / STAGING / name)
-
-
-def _is_small(path: Path, limit: int) -> bool:
-    return path.is_file() and path.stat().st_size < limit

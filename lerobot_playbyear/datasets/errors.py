@@ -39,10 +39,9 @@ def errors_of_input(*more: type[Exception]) -> Iterator[None]:
     Raises:
         InputError: In place of these.
     """
-    kinds: tuple[type[Exception], ...] = (ValueError, FileExistsError, *more)
     try:
         yield
     except PlaybyearError:
         raise
-    except kinds as error:
+    except (ValueError, FileExistsError, *more) as error:
         raise InputError(str(error)) from error

@@ -245,8 +245,7 @@ def check_features(features: Features, fps: float) -> None:
         _check_shape(key, feature)
         if not key.startswith(AUDIO_PREFIX):
             _check_type(key, feature)
-    check_audio_features(features, fps)
-    for key in audio_keys(features):
+    for key in check_audio_features(features, fps):
         rate = features[key]["info"]["sample_rate"]
         if not isinstance(rate, int):  # a reader takes any number that is whole; what is written is plain
             raise InputError(f"'{key}' has sample_rate {rate!r}; wanted whole Hz, a Python int such as 16000.")
@@ -291,13 +290,10 @@ def _check_shape(key: str, feature: Mapping[str, Any]) -> None:
     if not all(isinstance(size, int | np.integer) and size > 0 for size in sizes):
         raise InputError(f"'{key}' has shape {shape!r}; wanted a tuple of positive whole numbers.")
     if key.startswith(AUDIO_PREFIX) and len(shape) > 1:
-        n_channels = min(shape)
-        keys = f"'{key}_left' and '{key}_right'"
-        advice = (
-            f"every microphone is its own key: write {n_channels} features of shape ({max(shape)},), such as {keys}"
-        )
-        if n_channels == 1:
-            advice = f"wanted ({max(shape)},)"
+        advice = f"wanted ({max(shape)},)"
+        if (n_channels := min(shape)) > 1:
+            advice = f"every microphone is its own key: write {n_channels} features of shape ({max(shape)},), such as "
+            advice += f"'{key}_left' and '{key}_right'"
         raise InputError(f"'{key}' has shape {tuple(shape)}; {advice}.")
 
 

@@ -222,7 +222,7 @@ def new_folder(target: Path) -> Iterator[Path]:
 
 
 class FolderLock(contextlib.ExitStack):
-    """At most one process works in a folder: held until `release` or the end of the process, however it ends.
+    """At most one process works in a folder: held until `close` or the end of the process, however it ends.
 
     The lock's file stays where it is: two processes that found different files under its name could both hold one.
 
@@ -242,9 +242,6 @@ class FolderLock(contextlib.ExitStack):
             self.enter_context(FileLock(path, timeout=0, thread_local=False))
         except Timeout as error:
             raise FolderLockedError(in_use) from error
-
-    release = contextlib.ExitStack.close
-    """Lets another process in. Safe to call twice."""
 
 
 def scratch_folder() -> tempfile.TemporaryDirectory[str]:

@@ -205,11 +205,9 @@ def check_parts(root: Path, can_be_repaired: bool = False) -> None:
         if not list_files(root, f"{glob.escape(str(pattern.parent.parent))}/*/*{pattern.suffix}"):
             films = [path for path in entries_below(root) if path.suffix == pattern.suffix]
             films.sort(key=lambda path: key not in path.parts)
-            remedy = (
-                f"There are films in '{films[0].parent}': if they are these, move them there"
-                if films
-                else "Put them back"
-            )
+            remedy = "Put them back"
+            if films:
+                remedy = f"There are films in '{films[0].parent}': if they are these, move them there"
             raise InputError(
                 f"The dataset in '{root}' has no films of '{key}', which {INFO_PATH} says to be in '{root / pattern.parent}'. "
                 f"{remedy}, or correct video_path."

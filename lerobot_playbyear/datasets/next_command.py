@@ -20,9 +20,13 @@ def training_command(
         root: Its folder. None: LeRobot finds it by its name.
         preset: The preset. None: the one for this machine.
     """
+    if preset is None:
+        import torch  # here, because commands that work on files alone do without it
+
+        preset = "gpu" if torch.cuda.is_available() else "cpu"
     names = list(features)
     options = {
-        "preset": preset or ("gpu" if _has_gpu() else "cpu"),
+        "preset": preset,
         "dataset.repo_id": repo_id,
         "dataset.root": root,
         "output_dir": f"outputs/train/{repo_id.rpartition('/')[2]}",
@@ -31,11 +35,3 @@ def training_command(
     }
     given = (f"--{name}={value}" for name, value in options.items() if value is not None)
     return " ".join(["playbyear-train", *map(shlex.quote, given)])
-
-
-def _has_gpu() -> bool:
-    try:
-        import torch  # here, because commands that work on files alone do without it
-    except ImportError:
-        return False
-    return torch.cuda.is_available()

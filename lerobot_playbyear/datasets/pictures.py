@@ -123,19 +123,19 @@ def video_pictures(
         assert stream.time_base is not None
         _check_size(path, key, shape, stream.height, stream.width)
         container.seek(round(times[0] / stream.time_base) - 1, backward=True, any_frame=False, stream=stream)
-        frames = (frame for frame in container.decode(stream) if frame.pts is not None)
+        frames = ((frame.time, frame) for frame in container.decode(stream) if frame.time is not None)
         before = after = next(frames, None)
         for time in times:
-            while after is not None and _time(after) < time:
+            while after is not None and after[0] < time:
                 before, after = after, next(frames, None)
-            near = [frame for frame in (before, after) if frame is not None]
+            near = [timed for timed in (before, after) if timed is not None]
             if not near:
                 raise ValueError(f"{path} has no picture that can be decoded at {time:.4f} s or after it.")
-            frame = min(near, key=lambda frame: abs(_time(frame) - time))
-            if abs(_time(frame) - time) >= tolerance_s + float(np.spacing(np.float32(time))):
+            shown, frame = min(near, key=lambda timed: abs(timed[0] - time))
+            if abs(shown - time) >= tolerance_s + float(np.spacing(np.float32(time))):
                 raise ValueError(
                     f"{path} has no picture at {time:.4f} s (tolerance {tolerance_s:g} s); the nearest one is at "
-                    f"{_time(frame):.4f} s."
+                    f"{shown:.4f} s."
                 )
             _check_size(path, key, shape, frame.height, frame.width)  # which may change on the way
             yield frame.to_ndarray(format="rgb24")
@@ -147,11 +147,6 @@ def _check_size(path: Path, key: str, shape: Sequence[int] | None, height: int, 
             f"'{key}': the pictures of '{path}' have {width} x {height} pixels; meta/info.json gives the shape "
             f"{tuple(shape)}. Correct the shape, or record the dataset again."
         )
-
-
-def _time(frame: av.VideoFrame) -> float:
-    assert frame.time is not None
-    return frame.time
 
 
 def shrunk_size(height: int, width: int, image_size: int) -> tuple[int, int]:

@@ -8,7 +8,6 @@ repetition in a few bytes, and whoever reads it sees what LeRobot would have wri
 """
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,8 +27,6 @@ from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_ke
 Stats = dict[str, dict[str, np.ndarray]]
 """Per feature and statistic, as LeRobot keeps them."""
 
-_DIGITS = 5  # significant ones
-
 
 def sound_stats(sound: np.ndarray) -> dict[str, np.ndarray]:
     """Statistics of all samples of a microphone's frames, each repeated to the shape (S,).
@@ -42,7 +39,7 @@ def sound_stats(sound: np.ndarray) -> dict[str, np.ndarray]:
     values = values.astype(np.float64)
     mean = float(values @ counts / sound.size)
     pooled = {"min": values[0], "max": values[-1], "mean": mean}
-    pooled["std"] = math.sqrt(np.square(values - mean) @ counts / sound.size)
+    pooled["std"] = np.sqrt(np.square(values - mean) @ counts / sound.size)
     below = np.cumsum(counts)
     for share in DEFAULT_QUANTILES:
         pooled[f"q{int(share * 100):02d}"] = values[np.searchsorted(below, share * sound.size)]
@@ -109,6 +106,5 @@ def write_stats(stats: Stats, root: Path) -> None:
 
 
 def _rounded(value: float) -> float:
-    if value == 0 or not math.isfinite(value):
-        return value
-    return round(value, _DIGITS - 1 - math.floor(math.log10(abs(value))))
+    """To five significant digits."""
+    return float(f"{value:.5g}")

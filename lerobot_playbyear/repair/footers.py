@@ -11,9 +11,8 @@ parquet uses.
 import io
 import logging
 import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -34,8 +33,7 @@ class ThriftError(ValueError):
     """The bytes are no Thrift structure."""
 
 
-@dataclass
-class Elements:
+class Elements(NamedTuple):
     """A list of values of one type."""
 
     type: int
@@ -50,8 +48,7 @@ class Struct(dict[int, tuple[int, Any]]):
         return self[field][1] if field in self else None
 
 
-@dataclass
-class _Page:
+class _Page(NamedTuple):
     """One page: where it begins, its bytes with and without its header, and how many values it holds."""
 
     start: int
@@ -264,9 +261,7 @@ def _write_value(kind: int, value: Any) -> bytes:
         size = len(value.values)
         head = bytes([size << 4 | value.type]) if size < 15 else bytes([0xF0 | value.type]) + _varint(size)
         return head + b"".join(_write_value(value.type, element) for element in value.values)
-    if kind == STRUCT:
-        return write_struct(value)
-    raise ThriftError(f"type {kind} does not occur in parquet")
+    return write_struct(value)  # nothing else was read
 
 
 def _read_integer(stream: io.BytesIO) -> int:
