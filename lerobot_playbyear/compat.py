@@ -109,10 +109,8 @@ def metrics_tracker(accelerator: "Accelerator | None", *figures: Any, initial_st
     """LeRobot's `MetricsTracker`, of an accelerator's processes; None: of this one."""
     from lerobot.utils.logging_utils import MetricsTracker
 
-    processes: dict[str, Any]
-    if "accelerator" in signature(MetricsTracker).parameters:  # LeRobot 0.6.1
-        processes = {"accelerator": accelerator}
-    else:
+    processes: dict[str, Any] = {"accelerator": accelerator}
+    if "accelerator" not in signature(MetricsTracker).parameters:  # as in LeRobot 0.6.1
         processes = {"dp_world_size": 1 if accelerator is None else accelerator.num_processes}
     return MetricsTracker(*figures, initial_step=initial_step, **processes)
 

@@ -45,7 +45,7 @@ _SAVING = 2  # saving takes this many times the memory of the episode in additio
 _SPARE_BYTES = 256 * 2**20
 
 
-class DurableWriter:
+class DurableWriter(contextlib.AbstractContextManager["DurableWriter"]):
     """Appends episodes to a LeRobotDataset v3.0; each is on disk for good when `save_episode` returns.
 
     Protocol: the files that the dataset will have with the episode are written into its scratch folder; a journal is
@@ -76,6 +76,7 @@ class DurableWriter:
         DatasetWriteError: `root` cannot be read or written.
         FolderLockedError: Another process is writing to it.
         DatasetDamagedError: The dataset in `root` is damaged; the message says how, and what to do.
+        InputError: A whole part of it is missing; likewise.
         JournalError: What the dataset's scratch folder says is to be moved lies outside the dataset.
     """
 
@@ -194,9 +195,6 @@ class DurableWriter:
         self._pool.shutdown(cancel_futures=True)
         self._lock.close()
 
-    def __enter__(self) -> "DurableWriter":
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -312,6 +310,7 @@ def check_undamaged(root: Path) -> None:
 
     Raises:
         DatasetDamagedError: It is damaged; with what is wrong, and the command that repairs it.
+        InputError: A whole part of it is missing.
         DatasetWriteError: It cannot be read.
     """
     try:
@@ -319,10 +318,7 @@ def check_undamaged(root: Path) -> None:
     except OSError as error:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
     if not found.is_undamaged:
-        try:
-            check_parts(root)
-        except InputError as error:
-            raise DatasetDamagedError(str(error)) from error
+        check_parts(root)
         command = repair_command(root)
         raise DatasetDamagedError(
             f"{found}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "

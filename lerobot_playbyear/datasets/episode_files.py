@@ -27,14 +27,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot_playbyear.datasets.features import Features, is_depth
 from lerobot_playbyear.datasets.frame_rate import exact_rate
 from lerobot_playbyear.datasets.journal import STAGING, remove_staged
-from lerobot_playbyear.datasets.parquet import (
-    DataFile,
-    ParquetDamageError,
-    numpy_to_column,
-    read_table,
-    write_rows,
-    write_tables,
-)
+from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, numpy_to_column, write_rows, write_tables
 from lerobot_playbyear.datasets.pictures import decode_picture, open_film
 from lerobot_playbyear.datasets.statistics import add_stats, numeric_stats, picture_stats, stats_columns, write_stats
 
@@ -117,9 +110,9 @@ def _last_row(root: Path) -> tuple[Path | None, dict[str, Any]]:
     tables = sorted(root.glob("meta/episodes/*/*.parquet"))
     if not tables:
         return None, {}
-    names = [name for name in pq.read_schema(tables[-1]).names if not name.startswith("stats/")]
-    rows = read_table(tables[-1], names)
-    return tables[-1], rows.slice(rows.num_rows - 1).to_pylist()[0]
+    file = DataFile(tables[-1])
+    names = [name for name in file.schema.names if not name.startswith("stats/")]
+    return file.path, file.read(file.n_rows - 1, file.n_rows, names).to_pylist()[0]
 
 
 def _place(root: Path, template: str, last: Mapping[str, Any], prefix: str, chunks_size: int) -> tuple[Path, dict]:

@@ -39,9 +39,10 @@ def errors_of_input(*more: type[Exception]) -> Iterator[None]:
     Raises:
         InputError: In place of these.
     """
+    kinds: tuple[type[Exception], ...] = (ValueError, FileExistsError, *more)
     try:
         yield
     except PlaybyearError:
         raise
-    except (ValueError, FileExistsError, *more) as error:
+    except kinds as error:
         raise InputError(str(error)) from error

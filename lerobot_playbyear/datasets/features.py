@@ -41,7 +41,6 @@ MICROPHONE = "microphone"
 
 PCM_S16 = "pcm_s16"
 _PCM_S16_FULL_SCALE = 32768
-_DTYPES = ("int16", "float32", "float64")
 _MOST_SAMPLES_PER_S = 1_000_000
 
 
@@ -114,7 +113,7 @@ def _check_one(key: str, feature: Mapping[str, Any], fps: float) -> int:
             f"'{key}' has its sound in files (dtype 'audio'); wanted a column. Make one: playbyear-attach-audio, "
             "without --files and --session."
         )
-    if feature["dtype"] not in _DTYPES:
+    if feature["dtype"] not in ("int16", "float32", "float64"):
         raise ValueError(
             f"'{key}' has dtype {feature['dtype']!r}; wanted 'int16' (PCM) or 'float32' (in [-1, 1]). Convert the column."
         )

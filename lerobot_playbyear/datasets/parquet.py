@@ -181,7 +181,7 @@ class DataFile:
             return error
 
 
-def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
+def read_table(path: Path) -> pa.Table:
     """Reads a whole file, with checksums.
 
     Raises:
@@ -190,9 +190,8 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
         MemoryError: There is no room for it.
     """
     with open_checked(path) as file, parsing(path):
-        if columns is None:
-            check_room(path, file.metadata)
-        table = file.read(columns=columns, use_threads=False)
+        check_room(path, file.metadata)
+        table = file.read(use_threads=False)
         table.validate(full=True)
     return table
 

@@ -80,10 +80,8 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
 def encode_picture(picture: Image.Image, is_depth: bool, compress_level: int) -> bytes:
     """The file that LeRobot makes of a picture: PNG, or TIFF for distances."""
     file = io.BytesIO()
-    if is_depth:
-        picture.save(file, "TIFF", compression="raw")
-    else:
-        picture.save(file, "PNG", compress_level=compress_level)
+    how = {"format": "TIFF", "compression": "raw"} if is_depth else {"format": "PNG", "compress_level": compress_level}
+    picture.save(file, **how)
     return file.getvalue()
 
 

@@ -24,15 +24,7 @@ from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_key
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.frame_rate import frame_rate
-from lerobot_playbyear.datasets.info import (
-    INDEX_COLUMNS,
-    check_claims,
-    check_ordinary,
-    check_parts,
-    file_inside,
-    list_folder,
-    nothing_in,
-)
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS, check_parts, file_inside, list_folder, nothing_in, read_info
 from lerobot_playbyear.datasets.parquet import PIECE_BYTES, DataFile, column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.remedies import repair_command
@@ -44,6 +36,7 @@ if TYPE_CHECKING:
 
 _PICTURES_AT_ONCE = 64  # that are decoded ahead; fewer of large ones
 _LISTED = 3  # findings
+_MOST_CLAIMED = 4  # times as many episodes as are there; less than that is damage, which the survey names
 
 
 @dataclass
@@ -285,7 +278,8 @@ class SurveyedDataset(EpisodeReader):
     """
 
     def __init__(self, repo_id: str, found: Survey, episodes: Sequence[int] | None = None) -> None:
-        files = {each.frames.file.path: each.frames.file for each in found.whole if each.frames}
+        frames = [each.frames for each in found.whole if each.frames]
+        files = {each.file.path: each.file for each in frames}
         self.survey, self.info = found, found.info
         super().__init__(
             repo_id, found.root, self.info["fps"], self.info["features"], list(files.values()), found.tasks
@@ -293,7 +287,6 @@ class SurveyedDataset(EpisodeReader):
         self.chosen = None if episodes is None else set(episodes)
         self._places = {each.number: each.places for each in found.whole}
         first_of = dict(zip(files, self._firsts, strict=False))
-        frames = [each.frames for each in found.whole if each.frames]
         places = [(each.episode, first_of[each.file.path] + each.start, each.length) for each in frames]
         self._choose(place for place in places if self.chosen is None or place[0] in self.chosen)
 
@@ -386,8 +379,7 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
         MemoryError: There is no room for something.
     """
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
-    check_ordinary(folder)
-    if (folder / INFO_PATH).is_file():
+    if os.path.lexists(folder / INFO_PATH):
         _refuse_damage(_look(folder))
         return True
     if list_folder(folder):  # LeRobot fetches into no folder that holds other files
@@ -401,7 +393,7 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
             f"{nothing_in(folder)}, and '{repo_id}' could not be had from the Hub: {type(error).__name__}: "
             f"{first_line(error)}. Correct the name or the folder."
         ) from error
-    check_claims(Path(meta.root), 0 if meta.episodes is None else len(meta.episodes))
+    _check_claims(Path(meta.root), 0 if meta.episodes is None else len(meta.episodes))
     return False
 
 
@@ -409,8 +401,18 @@ def _look(folder: Path) -> Survey:
     """A quick survey of a dataset that has all of its parts, and claims no more than is there."""
     check_parts(folder)
     found = survey(folder, thorough=False)
-    check_claims(folder, len(found.episodes))
+    _check_claims(folder, len(found.episodes))
     return found
+
+
+def _check_claims(folder: Path, n_episodes: int) -> None:
+    """Refuses a dataset whose `meta/info.json` claims far more episodes than there are."""
+    total = read_info(folder)["total_episodes"]
+    if total > _MOST_CLAIMED * max(n_episodes, 1):
+        raise InputError(
+            f"{folder / INFO_PATH}: total_episodes is {total:,}, but meta/episodes has {n_episodes:,}. "
+            f"Repair it: {repair_command(folder)}"
+        )
 
 
 def _refuse_audio_files(features: Features) -> None:

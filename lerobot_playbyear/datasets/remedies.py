@@ -19,8 +19,7 @@ def convert_command(root: Path) -> str:
 
 def recompute_command(root: Path) -> str:
     """Recomputes `meta/stats.json`. Without the new name and place LeRobot would write a copy elsewhere."""
-    same = [f"--new_repo_id={_name(root)}", f"--new_root={root}"]
-    return _edit(root, *same, "--operation.type=recompute_stats", "--operation.overwrite=true")
+    return _edit(root, *_new(root), "--operation.type=recompute_stats", "--operation.overwrite=true")
 
 
 def task_command(root: Path, episodes: Sequence[int], task: str) -> str:
@@ -31,14 +30,14 @@ def task_command(root: Path, episodes: Sequence[int], task: str) -> str:
 
 def without_feature(root: Path, key: str) -> str:
     """Writes a copy without a feature; where, stands behind the command."""
-    target = f"{root}_without_{key.rsplit('.', 1)[-1]}"
+    target = Path(f"{root}_without_{key.rsplit('.', 1)[-1]}")
     names = f"--operation.feature_names={json.dumps([key], ensure_ascii=False)}"
     return f"{_edit(root, *_new(target), '--operation.type=remove_feature', names)} (it writes {target})"
 
 
 def without_episodes(root: Path, episodes: Sequence[int]) -> str:
     """Writes a copy without some episodes; where, stands behind the command."""
-    target, which = f"{root}_shorter", f"--operation.episode_indices={list(episodes)}"
+    target, which = Path(f"{root}_shorter"), f"--operation.episode_indices={list(episodes)}"
     return f"{_edit(root, *_new(target), '--operation.type=delete_episodes', which)} (it writes {target})"
 
 
@@ -46,8 +45,8 @@ def _edit(root: Path, *options: str) -> str:
     return shlex.join(["lerobot-edit-dataset", f"--repo_id={_name(root)}", f"--root={root}", *options])
 
 
-def _new(target: str) -> list[str]:
-    return [f"--new_repo_id={_name(Path(target))}", f"--new_root={target}"]
+def _new(target: Path) -> list[str]:
+    return [f"--new_repo_id={_name(target)}", f"--new_root={target}"]
 
 
 def _name(root: Path) -> str:

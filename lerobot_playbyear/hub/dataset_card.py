@@ -149,8 +149,7 @@ def _camera(dataset: SurveyedDataset, key: str) -> str:
 def _microphone(dataset: SurveyedDataset, key: str) -> str:
     feature = dataset.features[key]
     rate = (feature.get("info") or {}).get("sample_rate")
-    is_known = isinstance(rate, int | float)
-    known = f"{rate:,} Hz, " if is_known else f"sample rate {text(str(rate)) if rate else 'unknown'}, "
+    known = f"{rate:,} Hz, " if isinstance(rate, int | float) else f"sample rate {text(str(rate or 'unknown'))}, "
     return f"{code(key)}: {known}{feature['shape'][0]:,} samples a frame, {text(feature['dtype'])}"
 
 

@@ -24,7 +24,7 @@ from huggingface_hub.utils import validate_repo_id
 from lerobot_playbyear.compat import card_writer
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, first_line
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries_below, parse_json
-from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out, check_there
+from lerobot_playbyear.datasets.info import check_links, check_links_out, check_there
 from lerobot_playbyear.datasets.journal import locked
 from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.datasets.reader import SurveyedDataset
@@ -250,9 +250,6 @@ def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
     options.check()
     try:
         check_links_out(folder)
-    except OutsideError as error:
-        raise HubError(f"Not pushed. {error}") from error
-    try:
         config = PreTrainedConfig.from_pretrained(folder)
         config.repo_id, config.device = repo_id, "cpu"
         config.license = options.license or (word(config.license) if config.license else None)
@@ -285,17 +282,15 @@ def push_checkpoint(folder: Path, repo_id: str, private: bool | None = None) -> 
     A Hub that cannot be reached does not end the training: it is a warning.
 
     Args:
-        folder: The checkpoint's; its name, the step, becomes a tag.
+        folder: The checkpoint's, in `checkpoints/` of the run's; its name, the step, becomes a tag.
         repo_id: The policy's name on the Hub.
         private: Whether a repository that is created is private. None: as the account's default says.
     """
-    from lerobot.utils.constants import CHECKPOINTS_DIR
-
     try:
         check_links_out(folder)
         repository = _create(repo_id, "model", private)
         paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-        files = {f"{CHECKPOINTS_DIR}/{folder.name}/{path.relative_to(folder).as_posix()}": path for path in paths}
+        files = {path.relative_to(folder.parents[1]).as_posix(): path for path in paths}
         _tag(repository, folder.name, _commit(repository, files, f"checkpoint {folder.name}"))
     except Exception as error:  # as in `_upload`
         logger.warning("%s was not uploaded (%s). Work goes on without", folder, reason(error))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -105,15 +106,8 @@ def record(cfg: RecordConfig) -> Path:
             with errors_of_input():
                 _check_facts(facts, cfg)
                 features = dataset_features(facts, cfg.dataset.video)
-                writer = DurableWriter(
-                    cfg.dataset.repo_id,
-                    root,
-                    facts.fps,
-                    features,
-                    resume=cfg.resume,
-                    robot_type=cfg.env.type,
-                    rgb_encoder=cfg.dataset.rgb_encoder,
-                )
+                how: dict[str, Any] = {"robot_type": cfg.env.type, "rgb_encoder": cfg.dataset.rgb_encoder}
+                writer = DurableWriter(cfg.dataset.repo_id, root, facts.fps, features, resume=cfg.resume, **how)
             _say_what_differs(cfg.dataset)
             with writer:
                 seconds = writer.longest_episode / facts.fps
@@ -218,10 +212,7 @@ def _check_facts(facts: EnvFacts, cfg: RecordConfig) -> None:
             f"--env.type={env.type} --env.task={env.task} has no scripted expert, so there is nobody to record. "
             "Record a person with --expert.type=teleop."
         )
-    if facts.fps != env.fps:
-        raise InputError(f"--env.fps={env.fps}, but the environment runs at {facts.fps} steps per second: give that.")
-    if cfg.dataset.fps not in (None, facts.fps):
-        raise InputError(
-            f"--dataset.fps={cfg.dataset.fps}, but the environment runs at {facts.fps} steps per second: give that, or leave "
-            "it out."
-        )
+    for option, fps in (("env", env.fps), ("dataset", cfg.dataset.fps)):
+        if fps not in (None, facts.fps):
+            runs = f"the environment runs at {facts.fps} steps per second"
+            raise InputError(f"--{option}.fps={fps}, but {runs}: give that, or leave it out.")
