@@ -281,9 +281,7 @@ class SurveyedDataset(EpisodeReader):
         frames = [each.frames for each in found.whole if each.frames]
         files = {each.file.path: each.file for each in frames}
         self.survey, self.info = found, found.info
-        super().__init__(
-            repo_id, found.root, self.info["fps"], self.info["features"], list(files.values()), found.tasks
-        )
+        super().__init__(repo_id, found.root, found.info["fps"], found.info["features"], [*files.values()], found.tasks)
         self.chosen = None if episodes is None else set(episodes)
         self._places = {each.number: each.places for each in found.whole}
         first_of = dict(zip(files, self._firsts, strict=False))

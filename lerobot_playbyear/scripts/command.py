@@ -176,9 +176,8 @@ _ROBOT = {
 
 def for_robots(command: str, args: list[str]) -> str | None:
     """What to tell who gives a robot, or what moves one, to a command for simulations; None for all others."""
-    given = {
-        name: value for name, value in given_options(args)[0].items() if name.partition(".")[0] in ("robot", "teleop")
-    }
+    all_given, _ = given_options(args)
+    given = {name: value for name, value in all_given.items() if name.partition(".")[0] in ("robot", "teleop")}
     if command not in _ON_ROBOTS or not given:
         return None
     cameras = (given.get("robot.cameras") or "").strip().removeprefix("{").removesuffix("}")
