@@ -39,12 +39,8 @@ HEADER_BYTES = 44
 
 _LOOKED_AT = 3  # pictures of a camera that may be a microphone
 _CELL = 8  # pixels of a bit, a side
-_HEADER = np.dtype(
-    {
-        "names": ["magic", "session", "counter", "sample_rate", "low_db", "high_db", "checksum"],
-        "formats": ["S4", "<u4", "<u8", "<u4", "<f4", "<f4", "<u4"],
-    }
-)
+_HEADER = struct.Struct("<4sIQIff")  # magic, session, counter, sample rate, low and high level; a checksum follows
+_END_BYTES = _HEADER.size + 4
 _MAGIC = b"PBYS"
 HIGHEST_RATE = 1_000_000  # Hz
 
@@ -76,42 +72,32 @@ def n_kept(sample_rate: int) -> int:
 
 def n_rows(sample_rate: int, width: int) -> int:
     """Rows of pixels that a strip takes."""
-    return -(-(2 * n_kept(sample_rate) + _HEADER.itemsize) // (3 * width))
+    return -(-(2 * n_kept(sample_rate) + _END_BYTES) // (3 * width))
 
 
 def write_strip(picture: np.ndarray, strip: Strip) -> None:
     """Draws a strip over the lowest rows of a picture (H, W, 3) uint8, contiguous."""
     rows = picture[-n_rows(strip.sample_rate, picture.shape[1]) :].reshape(-1)
-    payload = np.ascontiguousarray(strip.samples, "<i2").view(np.uint8)
-    fields = (_MAGIC, strip.session, strip.counter, strip.sample_rate, strip.low_db, strip.high_db, 0)
-    header = np.array([fields], _HEADER)
-    header["checksum"] = _checksum(header, payload)
-    rows[: len(payload)] = payload
-    rows[len(payload) : -_HEADER.itemsize] = 0
-    rows[-_HEADER.itemsize :] = header.view(np.uint8)
+    payload = np.asarray(strip.samples, "<i2").tobytes()
+    header = _HEADER.pack(_MAGIC, strip.session, strip.counter, strip.sample_rate, strip.low_db, strip.high_db)
+    end = header + _checksum(header, payload)
+    rows[:] = np.frombuffer(payload + bytes(len(rows) - len(payload) - len(end)) + end, np.uint8)
 
 
 def read_strip(picture: np.ndarray) -> Strip | None:
     """The strip of a picture (H, W, 3) uint8, of which the lowest rows are enough; None where there is no whole one."""
     pixels = np.ascontiguousarray(picture, np.uint8)
-    if pixels.size < _HEADER.itemsize:
+    if pixels.size < _END_BYTES:
         return None
-    header = pixels.reshape(-1)[-_HEADER.itemsize :].copy().view(_HEADER)
-    if header["magic"][0] != _MAGIC or not 0 < header["sample_rate"][0] <= HIGHEST_RATE:
+    end = pixels.reshape(-1)[-_END_BYTES:].tobytes()
+    magic, session, counter, sample_rate, low_db, high_db = _HEADER.unpack_from(end)
+    if magic != _MAGIC or not 0 < sample_rate <= HIGHEST_RATE:
         return None
-    sample_rate = int(header["sample_rate"][0])
     rows = n_rows(sample_rate, pixels.shape[1])
-    if rows > len(pixels):
-        return None
     payload = pixels[-rows:].reshape(-1)[: 2 * n_kept(sample_rate)].copy()
-    said = int(header["checksum"][0])
-    header["checksum"] = 0
-    if _checksum(header, payload) != said:
+    if rows > len(pixels) or _checksum(end[: _HEADER.size], payload) != end[_HEADER.size :]:
         return None
-    session, counter, _, low_db, high_db = header[["session", "counter", "sample_rate", "low_db", "high_db"]][0]
-    return Strip(
-        int(session), int(counter), sample_rate, payload.view("<i2").astype(np.int16), float(low_db), float(high_db)
-    )
+    return Strip(session, counter, sample_rate, payload.view("<i2").astype(np.int16), low_db, high_db)
 
 
 def write_timecode(picture: np.ndarray, session: int, counter: int) -> None:
@@ -137,8 +123,9 @@ def read_timecode(picture: np.ndarray) -> tuple[int, int] | None:
     return session, counter
 
 
-def _checksum(header: np.ndarray, payload: np.ndarray) -> int:
-    return zlib.crc32(payload, zlib.crc32(header))
+def _checksum(header: bytes, payload: bytes | np.ndarray) -> bytes:
+    """Four bytes; it was defined over a header that has 0 in their place."""
+    return zlib.crc32(payload, zlib.crc32(header + bytes(4))).to_bytes(4, "little")
 
 
 def _code_checksum(code: bytes) -> bytes:
