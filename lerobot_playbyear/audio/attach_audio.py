@@ -9,7 +9,7 @@ LeRobot is imported when the dataset's files have been looked at.
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,20 +79,9 @@ class AttachAudioConfig:
             self.output = DatasetPlace(f"{self.dataset.repo_id}_with_sound", root)
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Of one episode: a recording in which its sound is, (n, channels) int16, and where.
-
-    Args:
-        samples, sample_rate: The recording [Hz].
-        start_s: When the episode's first frame was taken [s], on the clock of the frames.
-        speed: Seconds of the recording in a second of that clock.
-    """
-
-    samples: np.ndarray
-    sample_rate: int
-    start_s: float
-    speed: float = 1.0
+Recording = tuple[np.ndarray, int, float, float]
+"""Of one episode: a recording with its sound, (n, channels) int16; its rate [Hz]; when the episode's first frame was taken,
+from the recording's beginning on [s of the frames' clock]; and seconds of the recording in a second of that clock."""
 
 
 @dataclass(frozen=True)
@@ -312,11 +301,10 @@ def _read(sources: list[Source], cfg: AttachAudioConfig, dataset: DatasetReader,
         sound, first_with = PutAside(source.keys, scratch), dict[int, int]()
         for episode, rows in enumerate(tqdm(dataset.episodes, desc="Reading sound", unit="episode")):
             try:
-                heard = source.recording(episode)
-                rate = _new_rate(cfg, heard.sample_rate, fps, source.is_own)
+                samples, own_rate, start_s, speed = source.recording(episode)
+                rate = _new_rate(cfg, own_rate, fps, source.is_own)
                 first_with.setdefault(rate, episode)
-                own = (heard.samples, heard.sample_rate, fps, len(rows), heard.start_s)
-                sound.append(cut_into_frames(*own, cfg.pad, rate, heard.speed))
+                sound.append(cut_into_frames(samples, own_rate, fps, len(rows), start_s, cfg.pad, rate, speed))
             except (AudioFileError, ValueError) as error:
                 errors.append(f"{source.named(episode)}{error}")
         if len(first_with) > 1:
@@ -359,14 +347,14 @@ def _files(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], _: P
 
     def recording(episode: int) -> Recording:
         samples, rate = read_audio(path_of(episode))
-        return Recording(_choose_channels(cfg, samples, len(keys)), rate, offsets[episode])
+        return _choose_channels(cfg, samples, len(keys)), rate, offsets[episode], 1.0
 
     return Source(keys, lambda episode: f"episode {episode}, {path_of(episode)}: ", recording)
 
 
 def _session(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], scratch: Path) -> Source:
     """One recording of a whole session, and the times when the episodes began."""
-    line = read_marks(cfg.marks)
+    speed, began_s, error_s = read_marks(cfg.marks)
     n_episodes = dataset.meta.total_episodes
     starts, offsets = _starts(cfg, dataset.root, n_episodes), _offsets(cfg, n_episodes)
     path = Path(str(cfg.session))
@@ -378,13 +366,12 @@ def _session(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], sc
         raise InputError(f"Nothing was written. {path}: {error}") from error
     if cfg.marks is not None:
         print(
-            f"{path}: its clock runs at {line.speed:.6f} of the episodes' clock ({(line.speed - 1) * 1e6:+.0f} parts in a "
-            f"million); the marks fit to {line.error_s * 1000:.1f} ms."
+            f"{path}: its clock runs at {speed:.6f} of the episodes' clock ({(speed - 1) * 1e6:+.0f} parts in a million); "
+            f"the marks fit to {error_s * 1000:.1f} ms."
         )
 
     def recording(episode: int) -> Recording:
-        first_frame_s = line.sound_time(starts[episode]) + offsets[episode]
-        return Recording(samples, rate, first_frame_s / line.speed, line.speed)
+        return samples, rate, starts[episode] - began_s + offsets[episode] / speed, speed
 
     def named(episode: int) -> str:
         return f"episode {episode}, which began at {starts[episode]:.3f} s of the clock: in {path} "
@@ -414,26 +401,21 @@ def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
 
 def _own_files(track: AudioTrack, dataset: DatasetReader, scratch: Path) -> Source:
     """A microphone's files beside the frames, of several episodes each."""
-    decoded: dict[Path, tuple[np.ndarray, int] | AudioFileError] = {}
     needed_s: dict[Path, float] = {}  # to where in each file; one may decode to more than a disk holds
     for span, rows in zip(track.spans, dataset.episodes, strict=True):
         end_s = span.start_s + track.start_time_s + len(rows) / dataset.fps + _SPARE_S
         needed_s[span.path] = max(end_s, needed_s.get(span.path, 0.0))
 
+    @cache
+    def decoded(path: Path) -> tuple[np.ndarray, int]:
+        place = scratch / f"{track.key}-file-{list(needed_s).index(path)}"
+        return _decoded(_checked_pieces(track, path, needed_s[path]), place)
+
     def recording(episode: int) -> Recording:
         span = track.spans[episode]
-        if span.path not in decoded:
-            try:
-                pieces = _checked_pieces(track, span.path, needed_s[span.path])
-                decoded[span.path] = _decoded(pieces, scratch / f"{track.key}-file-{len(decoded)}")
-            except AudioFileError as error:
-                decoded[span.path] = error
-        found = decoded[span.path]
-        if isinstance(found, AudioFileError):
-            raise found
-        samples, rate = found
+        samples, rate = decoded(span.path)
         stop = len(samples) if span.end_s is None else round(span.end_s * rate)
-        return Recording(samples[round(span.start_s * rate) : stop], rate, track.start_time_s)
+        return samples[round(span.start_s * rate) : stop], rate, track.start_time_s, 1.0
 
     def named(episode: int) -> str:
         return f"'{track.key}', episode {episode}, {track.spans[episode].path}: "

@@ -13,7 +13,6 @@ import csv
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -176,40 +175,23 @@ def _seconds(value: Any, of: str) -> float:
     return seconds
 
 
-@dataclass(frozen=True)
-class ClockLine:
-    """Which time in a recording a time of the clock is: `sound_s = speed * (clock_s - origin_clock_s) + origin_sound_s`.
-
-    Args:
-        speed: Seconds of the recording in a second of the clock; 1.001: the recorder's clock is 0.1 % fast.
-        origin_clock_s: A moment on the clock [s].
-        origin_sound_s: The same moment in the recording [s].
-        error_s: How far the worst mark lies beside the line [s].
-    """
-
-    speed: float = 1.0
-    origin_clock_s: float = 0.0
-    origin_sound_s: float = 0.0
-    error_s: float = 0.0
-
-    def sound_time(self, clock_s: float) -> float:
-        """Where in the recording a moment of the clock lies [s]."""
-        return self.speed * (clock_s - self.origin_clock_s) + self.origin_sound_s
-
-
-def read_marks(text: str | None) -> ClockLine:
-    """The line through moments that are known on both clocks.
+def read_marks(text: str | None) -> tuple[float, float, float]:
+    """How a recording's clock runs, by moments that are known on another clock as well.
 
     Args:
         text: `2.31=1754400000.12, 1802.74=1754401800.55`: seconds in the recording = seconds on the clock, for each mark.
             One mark says where the recording begins, two or more also how fast its clock runs. None: the clock is the
             recording's own.
 
+    Returns:
+        Seconds of the recording in a second of the clock (1.001: the recorder's clock is 0.1 % fast); when the recording
+        began, on the clock [s]; and how far the worst mark lies beside that line [s].
+
     Raises:
         ClockError: It is written otherwise, or no two clocks differ that much.
     """
     if text is None:
-        return ClockLine()
+        return 1.0, 0.0, 0.0
     pairs = []
     for part in text.split(","):
         try:
@@ -234,4 +216,4 @@ def read_marks(text: str | None) -> ClockLine:
             f"--marks={text}: {speed:.4f} seconds of sound in a second of the clock; wanted {1 - _MOST_DRIFT} to "
             f"{1 + _MOST_DRIFT}: no two clocks differ that much. Each mark is seconds in the sound file = seconds on the clock."
         )
-    return ClockLine(speed, origin_clock, origin_sound, error)
+    return speed, origin_clock - origin_sound / speed, error
