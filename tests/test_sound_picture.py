@@ -25,7 +25,7 @@ from support.shared import run_in_process
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.audio import attach_spectrogram as attaching
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
-from lerobot_playbyear.audio.sound_picture import SoundPicture, pictures_of, read_pictures
+from lerobot_playbyear.audio.sound_picture import HeardSound, SoundPicture, pictures_of, read_pictures
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.reader import DatasetPlace
@@ -34,7 +34,6 @@ from lerobot_playbyear.episodes import frames
 from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.pool import Script
-from lerobot_playbyear.episodes.spectrogram_env import HeardSound
 from lerobot_playbyear.recording.record import RecordConfig, record
 
 PICTURE = "observation.images.gripper"

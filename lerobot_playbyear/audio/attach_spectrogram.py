@@ -13,7 +13,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach_audio import open_for_copy, output_folder
-from lerobot_playbyear.audio.sound_picture import FLOOR_DB, PICTURE_PREFIX, SoundPicture
+from lerobot_playbyear.audio.sound_picture import FLOOR_DB, PICTURE_PREFIX, HeardSound, SoundPicture
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
 from lerobot_playbyear.datasets.pictures import encode_picture
@@ -142,7 +142,7 @@ def _with_levels(dataset: DatasetReader, plan: SoundPicture, cfg: AttachSpectrog
     edges = np.arange(FLOOR_DB, _LOUDEST_DB + _STEP_DB / 2, _STEP_DB)
     counts = np.zeros((plan.height, len(edges) - 1), np.int64)
     bands = np.arange(plan.height)
-    heard = (frame for episode in dataset.episodes for frame in _contexts(dataset, plan, episode))
+    heard = (frame for each in dataset.episodes for frame in map(HeardSound(plan).hear, _blocks(dataset, plan, each)))
     for sound, n_heard in tqdm(heard, "Hearing", len(dataset), unit="frame", delay=1):
         levels = plan.levels(sound)[plan.begun(n_heard)]
         bins = np.clip(((levels - FLOOR_DB) / _STEP_DB).astype(int), 0, counts.shape[1] - 1)
@@ -158,11 +158,10 @@ def _with_levels(dataset: DatasetReader, plan: SoundPicture, cfg: AttachSpectrog
         low = float(edges[np.searchsorted(np.cumsum(total), _QUIET_SHARE * total.sum())])
     if high is None:
         high = max(float(edges[np.flatnonzero(total)[-1] + 1]), low + _LEAST_RANGE_DB)
-    low, high = round(low, 1), round(high, 1)
+    fitted = replace(plan, low_db=round(low, 1), high_db=round(high, 1))
     halves = counts.sum(axis=1, keepdims=True) / 2
     median = edges[(np.cumsum(counts, axis=1) < halves).sum(axis=1)]  # (height,)
-    usual = np.rint(255 * np.clip((median - low) / (high - low), 0, 1)).astype(int)
-    return replace(plan, low_db=low, high_db=high, before_episode=tuple(usual.tolist()))
+    return replace(fitted, before_episode=tuple(fitted.pixels_of(median).tolist()))
 
 
 def _column(dataset: DatasetReader, how: SoundPicture) -> "AddedColumn":
@@ -183,16 +182,10 @@ def _column(dataset: DatasetReader, how: SoundPicture) -> "AddedColumn":
 
 
 def _pictures(dataset: DatasetReader, how: SoundPicture, episode: EpisodeRows) -> Iterator[np.ndarray]:
-    """Those of an episode's frames, (height, width, 3) uint8 each. Their columns, which neighbours share, are made once."""
-    columns: list[np.ndarray] = []
-    for sound, n_heard in _contexts(dataset, how, episode):
-        columns = [*columns, how.columns(sound, n_heard)][-how.n_frames :]
-        yield how.picture(np.concatenate(columns))
+    """Those of an episode's frames, (height, width, 3) uint8 each."""
+    return map(HeardSound(how).add, _blocks(dataset, how, episode))
 
 
-def _contexts(dataset: DatasetReader, how: SoundPicture, episode: EpisodeRows) -> Iterator[tuple[np.ndarray, int]]:
-    """For every frame the samples that its columns depend on, (context,), and how many of them belong to its episode."""
-    sound = dataset.sound(how.microphone, episode)
-    sound = np.concatenate([np.zeros(how.context, sound.dtype), sound])
-    for n_heard in range(how.samples_per_frame, (len(episode) + 1) * how.samples_per_frame, how.samples_per_frame):
-        yield sound[n_heard : n_heard + how.context], min(n_heard, how.context)
+def _blocks(dataset: DatasetReader, how: SoundPicture, episode: EpisodeRows) -> np.ndarray:
+    """The sound of an episode, (n_frames, S)."""
+    return dataset.sound(how.microphone, episode).reshape(len(episode), -1)

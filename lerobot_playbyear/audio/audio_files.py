@@ -306,19 +306,28 @@ def interpolate(samples: np.ndarray, places: np.ndarray) -> np.ndarray:
     """What sound is between its samples.
 
     Args:
-        samples: (n,) int16.
+        samples: (n,) or (n, channels) int16.
         places: (m,), each at least `HALF - 1` samples after the first and `HALF` before the last one.
 
     Returns:
-        (m,) int16.
+        (m,) or (m, channels) int16.
     """
     whole = np.floor(places).astype(np.int64)
     phase = (places - whole) * _PHASES
     index = phase.astype(np.int64)
     share = (phase - index)[:, None]
     kernel = (1 - share) * _KERNELS[index] + share * _KERNELS[index + 1]  # (m, 2 * HALF)
-    around = samples[whole[:, None] + np.arange(1 - HALF, HALF + 1)]
-    return np.clip(np.rint((kernel * around).sum(axis=1)), -32768, 32767).astype(np.int16)
+    around = samples[whole[:, None] + np.arange(1 - HALF, HALF + 1)]  # (m, 2 * HALF, ...)
+    summed = (kernel.reshape(*kernel.shape, *[1] * (samples.ndim - 1)) * around).sum(axis=1)
+    return np.clip(np.rint(summed), -32768, 32767).astype(np.int16)
+
+
+def section(samples: np.ndarray, start: int, stop: int) -> np.ndarray:
+    """Samples (n, ...) from one number to before another, which may lie outside: there they are 0."""
+    there = np.asarray(samples[max(start, 0) : max(stop, 0)])
+    before = min(max(-start, 0), stop - start)
+    padding = [(before, stop - start - before - len(there)), *[(0, 0)] * (samples.ndim - 1)]
+    return np.pad(there, padding)
 
 
 def cut_into_frames(
@@ -374,10 +383,7 @@ def cut_into_frames(
     last = min(-(-stop // new) * old + margin, n_steady)
     part = resample(_without_drift(waveform, first, max(first, last), speed), sample_rate, rate)
     skipped = first // old * new
-    inside = part[max(start - skipped, 0) : max(stop - skipped, 0)]
-    before = min(max(-start, 0), stop - start)
-    padding = [(before, stop - start - before - len(inside)), *[(0, 0)] * (waveform.ndim - 1)]
-    return np.pad(inside, padding).reshape(n_frames, size, *waveform.shape[1:])
+    return section(part, start - skipped, stop - skipped).reshape(n_frames, size, *waveform.shape[1:])
 
 
 def _without_drift(waveform: np.ndarray, first: int, last: int, speed: float) -> np.ndarray:
@@ -385,16 +391,9 @@ def _without_drift(waveform: np.ndarray, first: int, last: int, speed: float) ->
     if speed == 1 or first == last:
         return np.asarray(waveform[first:last])
     begin, end = int(first * speed) - HALF, int(last * speed) + HALF + 1
-    samples = np.asarray(waveform[max(begin, 0) : end])
-    before = max(-begin, 0)
-    padding = [(before, end - begin - before - len(samples)), *[(0, 0)] * (waveform.ndim - 1)]
-    channels = np.pad(samples, padding).reshape(end - begin, -1).T
+    samples = section(waveform, begin, end)
     edges = [*range(first, last, _PLACES_AT_ONCE), last]
-    steady = [
-        np.concatenate([interpolate(channel, np.arange(a, b) * speed - begin) for a, b in itertools.pairwise(edges)])
-        for channel in channels
-    ]
-    return np.stack(steady, axis=1).reshape(last - first, *waveform.shape[1:])
+    return np.concatenate([interpolate(samples, np.arange(a, b) * speed - begin) for a, b in itertools.pairwise(edges)])
 
 
 def _to_samples(frame: Any) -> np.ndarray:

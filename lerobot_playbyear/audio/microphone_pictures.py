@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from lerobot_playbyear.audio.audio_files import section
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, MICROPHONE
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
@@ -171,8 +172,7 @@ class SessionSound:
 
     def samples(self, start: int, stop: int) -> np.ndarray:
         """Samples from one number to before another, (n,) int16; 0 before the first. The last one must be there."""
-        before = np.zeros(max(min(-start, stop - start), 0), np.int16)
-        return np.concatenate([before, np.asarray(self._samples[max(start, 0) : max(stop, 0)], np.int16)])
+        return section(self._samples, start, stop).astype(np.int16)
 
 
 def audio_key_of(picture: str) -> str:

@@ -8,6 +8,7 @@ Here is numpy alone, in double precision and without matrix products, whose sums
 same samples give the same picture, whichever process makes it. Environments need neither torch nor LeRobot for it.
 """
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
@@ -202,17 +203,47 @@ class SoundPicture:
         weights, and where each band begins among them."""
         size = 1 << (self.segment - 1).bit_length()
         bank = mel_bank(self.height, size, self.sample_rate)
-        while not all(len(weights) for _, weights in bank):
+        while not all(len(bins) for bins, _ in bank):
             size *= 2
             if size > _LONGEST_FFT:
                 raise self._error("height", "fewer bands")
             bank = mel_bank(self.height, size, self.sample_rate)
-        bins = np.concatenate([first + np.arange(len(weights)) for first, weights in bank])
-        lengths = [len(weights) for _, weights in bank]
-        return size, bins, np.concatenate([weights for _, weights in bank]), np.cumsum([0, *lengths[:-1]])
+        bins, weights = map(np.concatenate, zip(*bank, strict=True))
+        return size, bins, weights, np.cumsum([0, *(len(bins) for bins, _ in bank[:-1])])
 
     def _error(self, name: str, wanted: str) -> InputError:
         return InputError(f"The picture of '{self.microphone}': {name}={getattr(self, name)!r}; wanted {wanted}.")
+
+
+class HeardSound:
+    """What a microphone hears in an episode, frame by frame, as pictures.
+
+    Args:
+        picture: How they are made.
+    """
+
+    def __init__(self, picture: SoundPicture) -> None:
+        self._how = picture
+        self._frames: deque[np.ndarray] = deque(maxlen=picture.n_frames)
+        self._blocks: deque[np.ndarray] = deque(maxlen=-(-picture.context // picture.samples_per_frame))
+
+    def clear(self) -> None:
+        """An episode begins."""
+        self._frames.clear()
+        self._blocks.clear()
+
+    def hear(self, block: np.ndarray) -> tuple[np.ndarray, int]:
+        """Takes the samples since the previous frame, (S,), and gives those that the frame's columns depend on, (context,), and
+        how many of them belong to the episode."""
+        self._blocks.append(block.copy())
+        heard = np.concatenate(self._blocks)[-self._how.context :]
+        return np.concatenate([np.zeros(self._how.context - len(heard), heard.dtype), heard]), len(heard)
+
+    def add(self, block: np.ndarray) -> np.ndarray:
+        """Takes the samples since the previous frame, (S,), and gives the frame's picture, (height, width, 3) uint8. Its
+        columns, which later frames share, are made once."""
+        self._frames.append(self._how.columns(*self.hear(block)))
+        return self._how.picture(np.concatenate(self._frames))
 
 
 class RollingSpectrogram:
@@ -257,11 +288,11 @@ class RollingSpectrogram:
         return self._grey
 
 
-def mel_bank(n_bands: int, fft_size: int, sample_rate: int) -> list[tuple[int, np.ndarray]]:
+def mel_bank(n_bands: int, fft_size: int, sample_rate: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Overlapping triangles, equally wide on the mel scale (2595 log10(1 + f / 700), as torchaudio's default has it).
 
     Returns:
-        For each band the first bin with a weight, and the weights from there on.
+        For each band the bins with a weight, which follow each other, and their weights.
     """
     highest = 2595 * np.log10(1 + sample_rate / 2 / 700)
     edges = 700 * (10 ** (np.linspace(0, highest, n_bands + 2) / 2595) - 1)
@@ -270,8 +301,7 @@ def mel_bank(n_bands: int, fft_size: int, sample_rate: int) -> list[tuple[int, n
     for low, peak, high in zip(edges, edges[1:], edges[2:], strict=False):
         weights = np.minimum((frequency - low) / (peak - low), (high - frequency) / (high - peak))
         inside = np.flatnonzero(weights > 0)
-        first = int(inside[0]) if len(inside) else 0
-        bank.append((first, weights[inside]))
+        bank.append((inside, weights[inside]))
     return bank
 
 

@@ -6,7 +6,6 @@ the first. An environment knows when its episode begins. The picture is one more
 (vector environments in one process or in several, `preprocess_observation`, the policy's normalisation) is LeRobot's own.
 """
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,38 +15,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from lerobot_playbyear.audio.sound_picture import SoundPicture, read_pictures
+from lerobot_playbyear.audio.sound_picture import HeardSound, SoundPicture, read_pictures
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 
 _PIXELS = "pixels"
-
-
-class HeardSound:
-    """One microphone's sound of the last seconds, as a picture.
-
-    Args:
-        picture: How it is made.
-    """
-
-    def __init__(self, picture: SoundPicture) -> None:
-        self._how = picture
-        self._frames: deque[np.ndarray] = deque(maxlen=picture.n_frames)
-        self._blocks: deque[np.ndarray] = deque(maxlen=-(-picture.context // picture.samples_per_frame))
-
-    def clear(self) -> None:
-        """An episode begins."""
-        self._frames.clear()
-        self._blocks.clear()
-
-    def add(self, block: np.ndarray) -> np.ndarray:
-        """Hears the samples since the previous frame, (S,), and gives the frame's picture, (height, width, 3) uint8."""
-        how = self._how
-        self._blocks.append(block.copy())
-        heard = np.concatenate(self._blocks)[-how.context :]
-        sound = np.concatenate([np.zeros(how.context - len(heard), heard.dtype), heard])
-        self._frames.append(how.columns(sound, len(heard)))
-        return how.picture(np.concatenate(self._frames))
 
 
 class WithSoundPictures(gym.ObservationWrapper):
@@ -60,7 +32,7 @@ class WithSoundPictures(gym.ObservationWrapper):
 
     def __init__(self, env: gym.Env, pictures: Sequence[SoundPicture]) -> None:
         super().__init__(env)
-        self._heard = {(_raw_key(how), how.name): HeardSound(how) for how in pictures}
+        self._heard = {(how.microphone.removeprefix("observation."), how.name): HeardSound(how) for how in pictures}
         assert isinstance(env.observation_space, spaces.Dict)
         pixels = env.observation_space.spaces.get(_PIXELS)
         cameras = dict(pixels.spaces) if isinstance(pixels, spaces.Dict) else {}
@@ -116,7 +88,3 @@ def pictures_for(
 
 def _make(make: Callable[[], gym.Env], pictures: Sequence[SoundPicture]) -> gym.Env:
     return WithSoundPictures(make(), pictures)
-
-
-def _raw_key(how: SoundPicture) -> str:
-    return "audio." + how.microphone.removeprefix(AUDIO_PREFIX)
