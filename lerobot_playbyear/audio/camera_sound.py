@@ -109,8 +109,7 @@ class _MicrophoneReader:
         self._taken: dict[int, tuple[int, int]] = {}  # of each session's file, from which sample to which
         self._spacing: list[list[int]] = []  # of each episode, samples from frame to frame
         self._errors: dict[str, list[int]] = {}  # what is wrong, and in which episodes
-        self._rate = 0  # of the column [Hz]
-        self._steps: ControlStepSound | None = None
+        self._rate = 0  # of the microphone [Hz]
 
     def read(self) -> tuple[Columns, list[np.ndarray]]:
         """The sound of all episodes, and which of their frames are the first ones, (n,) bool."""
@@ -125,7 +124,7 @@ class _MicrophoneReader:
             file = self._files[session]
             seconds = f"{start / file.sample_rate:.1f} to {stop / file.sample_rate:.1f} s"
             print(printable(f"{self._key}: {seconds} of {file.path}"))
-        return self._sound.columns(self._rate, self._dataset.fps), is_first
+        return self._sound.columns(self._new_rate, self._dataset.fps), is_first
 
     def _read_episode(self, episode: int, pictures: Iterator[np.ndarray]) -> np.ndarray:
         """Puts an episode's sound aside, and says what was exact. Returns which frames are the first ones, (n,) bool."""
@@ -133,15 +132,16 @@ class _MicrophoneReader:
         is_first: list[bool] = []
         self._spacing.append([])
         n_read = n_strips = 0
-        if self._steps is not None:
-            self._steps.reset()
+        steps: ControlStepSound | None = None
         try:
             for frame in _known(map(_read_frame, pictures), self._samples_per_frame):
-                block, starts = self._sound_of(frame)
+                strip = self._strip(frame)
+                steps = steps or ControlStepSound(samples_per_frame(self._new_rate, self._dataset.fps))
+                block, starts = steps.next(strip)
                 blocks.append(block)
                 is_first.append(starts)
-                if self._steps is not None and self._steps.n_heard is not None and not starts:
-                    self._spacing[-1].append(self._steps.n_heard)
+                if steps.n_heard is not None and not starts:
+                    self._spacing[-1].append(steps.n_heard)
                 n_read, n_strips = n_read + frame.was_read, n_strips + (frame.strip is not None)
         except (ValueError, OSError) as error:
             self._errors.setdefault(str(error), []).append(episode)
@@ -155,18 +155,20 @@ class _MicrophoneReader:
         tqdm.write(f"episode {episode}, {audio_key_of(self._key)}: {len(is_first)} frames, exact samples of {told}")
         return np.array(is_first)
 
-    def _sound_of(self, frame: _Frame) -> tuple[np.ndarray, bool]:
+    @property
+    def _new_rate(self) -> int:
+        """Of the column [Hz]."""
+        return nearest_sample_rate(self._rate, self._dataset.fps)
+
+    def _strip(self, frame: _Frame) -> Strip:
         strip = frame.strip or self._from_file(frame)
-        rate = nearest_sample_rate(strip.sample_rate, self._dataset.fps)
-        if self._steps is None:
-            self._rate, self._source_rate = rate, strip.sample_rate
-            self._steps = ControlStepSound(samples_per_frame(rate, self._dataset.fps))
-        if strip.sample_rate != self._source_rate:
+        self._rate = self._rate or strip.sample_rate
+        if strip.sample_rate != self._rate:
             raise ValueError(
-                f"it has {strip.sample_rate} samples per second, and those before {self._source_rate}: all "
-                "episodes of a dataset need one sample_rate"
+                f"it has {strip.sample_rate} samples per second, and those before {self._rate}: all episodes of a dataset "
+                "need one sample_rate"
             )
-        return self._steps.next(strip)
+        return strip
 
     def _from_file(self, frame: _Frame) -> Strip:
         """What the strip would hold, from the session's file.
@@ -215,18 +217,15 @@ class _MicrophoneReader:
         Raises:
             InputError: They are not.
         """
-        fps, rate = self._dataset.fps, self._source_rate
-        try:
-            check_pace([n for own in self._spacing for n in own], rate, fps, "the dataset")
-        except ValueError as error:
-            raise InputError(f"Nothing was written. {self._key}: {error}.") from error
+        fps, rate = self._dataset.fps, self._rate
+        whole = [n for own in self._spacing for n in own]
+        check_pace(whole, rate, fps, "the dataset", f"Nothing was written. {self._key}: ")
         for episode, own in enumerate(self._spacing):
             try:
                 check_pace(own, rate, fps, f"episode {episode}", is_live=True)
-            except ValueError as error:
-                logging.warning(
-                    "%s: %s. To leave it out: %s", self._key, error, without_episodes(self._dataset.root, [episode])
-                )
+            except InputError as error:
+                remedy = without_episodes(self._dataset.root, [episode])
+                logging.warning("%s: %s To leave it out: %s", self._key, error, remedy)
 
 
 def _read_frame(picture: np.ndarray) -> _Frame | None:

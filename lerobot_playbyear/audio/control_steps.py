@@ -17,6 +17,7 @@ import numpy as np
 
 from lerobot_playbyear.audio.audio_files import HALF, interpolate
 from lerobot_playbyear.audio.microphone_pictures import KEPT_S, Strip
+from lerobot_playbyear.datasets.errors import InputError
 
 PAUSE_S = 0.5
 """Steps further apart than this do not belong together: a pause or a takeover lies between them [s]."""
@@ -70,24 +71,25 @@ class ControlStepSound:
         return interpolate(strip.samples, places), is_first
 
 
-def check_pace(spacing: Sequence[int], sample_rate: int, fps: float, what: str, is_live: bool = False) -> None:
+def check_pace(spacing: Sequence[int], rate: int, fps: float, what: str, so: str = "", is_live: bool = False) -> None:
     """Whether control steps are as long as a frame rate says: LeRobot compares `--fps` and `--dataset.fps` with nothing.
 
     Args:
         spacing: Samples between steps.
-        sample_rate: Of these samples [Hz].
+        rate: Of these samples [Hz].
         fps: The frame rate [Hz].
         what: Whose it is, for the message.
+        so: What follows from it, as the error begins.
         is_live: A robot moves: that it is slow is only told.
 
     Raises:
-        ValueError: They are so much shorter or longer that another frame rate was meant.
+        InputError: They are so much shorter or longer that another frame rate was meant.
     """
     if len(spacing) < 5:
         return
-    seen = float(np.median(spacing)) * fps / sample_rate
+    seen = float(np.median(spacing)) * fps / rate
     told = f"{what} has fps={fps:g}, and the control steps are {1000 * seen / fps:.1f} ms apart ({fps / seen:.1f} per second)"
     if seen < _FASTEST or (seen > _SLOWEST and not is_live):
-        raise ValueError(f"{told}: use one rate for --fps and --dataset.fps")
+        raise InputError(f"{so}{told}: use one rate for --fps and --dataset.fps.")
     if abs(seen - 1) > _USUAL:
         logging.warning("%s: the machine is too slow, or too busy.", told)

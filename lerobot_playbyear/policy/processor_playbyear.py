@@ -151,10 +151,8 @@ class MicrophonePicturesToAudioStep(SoundStep):
             return
         self._spacing.append(n_heard)
         if len(self._spacing) == _PACE_STEPS.stop:
-            try:
-                check_pace(self._spacing[_PACE_STEPS], sample_rate, self.fps, "the policy", is_live=True)
-            except ValueError as error:
-                raise InputError(f"The control loop does not fit the policy: {error}.") from error
+            misfit = "The control loop does not fit the policy: "
+            check_pace(self._spacing[_PACE_STEPS], sample_rate, self.fps, "the policy", misfit, is_live=True)
 
     def _missing(self, key: str, observation: dict) -> str:
         name = key.removeprefix(AUDIO_PREFIX)
