@@ -45,12 +45,7 @@ KEYS = {
 }
 """What the panel beside the scene says, and docs/how_to/record.md."""
 
-_VERDICTS = {
-    SUCCESS: Verdict.SUCCESS,
-    FAILURE: Verdict.FAILURE,
-    END: Verdict.ENDED,
-    RERECORD: Verdict.DISCARD,
-}
+_VERDICTS = {SUCCESS: Verdict.SUCCESS, FAILURE: Verdict.FAILURE, END: Verdict.ENDED, RERECORD: Verdict.DISCARD}
 _EVENTS = (
     (TeleopEvents.RERECORD_EPISODE, Verdict.DISCARD),
     (TeleopEvents.SUCCESS, Verdict.SUCCESS),
@@ -64,66 +59,56 @@ class PersonLeftError(KeyboardInterrupt):
     """The person wants to leave: the command ends as with Ctrl-C, and what was saved is safe."""
 
 
-@dataclass(frozen=True)
-class Wish:
-    """What a person wants.
-
-    Attributes:
-        action: What the teleoperator gives.
-        overrides: They want to act instead of the policy.
-        toggles_gripper, toggles_pause: They pressed for it.
-        verdict: How they end the attempt, if so.
-        leaves: They want to end the session.
-    """
-
-    action: Mapping[str, Any]
-    overrides: bool = False
-    toggles_gripper: bool = False
-    toggles_pause: bool = False
-    verdict: Verdict | None = None
-    leaves: bool = False
-
-
 class Controls:
-    """Reads both once per step.
+    """What a person wants, by both, read once per step.
 
     Args:
         teleop: A connected teleoperator; `get_teleop_events` is used if it has it.
         keys: The window's.
         toggles: Whether a press of the key takes over, or hands back; otherwise it is held.
         override: The key.
+
+    Attributes:
+        action: What the teleoperator gives.
+        overrides: They want to act instead of the policy.
+        toggles_gripper, toggles_pause: They pressed for it.
+        verdict: How they end the attempt, if so.
     """
 
     def __init__(self, teleop: Teleoperator, keys: WindowKeys, toggles: bool = True, override: str = OVERRIDE) -> None:
         self._teleop, self._keys = teleop, keys
         self._toggles, self._override, self._is_on = toggles, override, False
         self._events: dict[TeleopEvents, bool] = {}
+        self.action: Mapping[str, Any] = {}
+        self.overrides = self.toggles_gripper = self.toggles_pause = False
+        self.verdict: Verdict | None = None
 
     def reset(self) -> None:
         """A new attempt: nobody has taken over."""
         self._is_on = False
 
-    def read(self) -> Wish:
-        """What a person wants now; what was pressed counts once, and then never again."""
-        if not self._teleop.is_connected:
-            return Wish(action={}, leaves=True)
+    def read(self) -> None:
+        """Takes in what a person wants now; what was pressed counts once, and then never again.
+
+        Raises:
+            PersonLeftError: They want to end the session, or unplugged the teleoperator.
+        """
         self._keys.look()
-        action: Mapping[str, Any] = self._teleop.get_action()
+        if not self._teleop.is_connected or LEAVE in self._keys.pressed:
+            raise PersonLeftError
+        self.action = self._teleop.get_action()
         events = dict(self._teleop.get_teleop_events()) if hasattr(self._teleop, "get_teleop_events") else {}
         began = {event for event, is_on in events.items() if is_on and not self._events.get(event, False)}
         self._events = events
         pressed = self._keys.pressed
-        verdict = next((verdict for key, verdict in _VERDICTS.items() if key in pressed), None)
         self._is_on ^= pressed.count(self._override) % 2 == 1
         by_key = self._is_on if self._toggles else self._override in self._keys.held
-        return Wish(
-            action=action,
-            overrides=by_key or events.get(TeleopEvents.IS_INTERVENTION, False),
-            toggles_gripper=pressed.count(GRIPPER_KEY) % 2 == 1,
-            toggles_pause=pressed.count(PAUSE) % 2 == 1,
-            verdict=verdict or next((verdict for event, verdict in _EVENTS if event in began), None),
-            leaves=LEAVE in pressed,
-        )
+        self.overrides = by_key or events.get(TeleopEvents.IS_INTERVENTION, False)
+        self.toggles_gripper = pressed.count(GRIPPER_KEY) % 2 == 1
+        self.toggles_pause = pressed.count(PAUSE) % 2 == 1
+        ends = [verdict for key, verdict in _VERDICTS.items() if key in pressed]
+        ends += [verdict for event, verdict in _EVENTS if event in began]
+        self.verdict = ends[0] if ends else None
 
 
 @TeleoperatorConfig.register_subclass("keyboard_window")

@@ -12,7 +12,7 @@ from lerobot.teleoperators import Teleoperator
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.experts import Expert
 from lerobot_playbyear.episodes.play import Observation, Verdict
-from lerobot_playbyear.teleoperation.controls import KEYS, ActionMapping, Controls, Gripper, PersonLeftError, Wish
+from lerobot_playbyear.teleoperation.controls import KEYS, ActionMapping, Controls, Gripper, PersonLeftError
 from lerobot_playbyear.teleoperation.panel import HISTORY_S, Control, Status
 from lerobot_playbyear.teleoperation.speaker import Speaker, level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.window import Window
@@ -118,7 +118,6 @@ class TeleopExpert(Expert):
         key, toggles = options.takeover_key.lower(), options.takeover == "toggle"
         self._controls = Controls(teleop, window.keys, toggles, key)
         self._begins_paused = options.begin_paused
-        self._wish = Wish({})
         self._is_called = self._stays = False
         self._verdict: Verdict | None = None
         self._last_command: float | None = None
@@ -145,8 +144,7 @@ class TeleopExpert(Expert):
         status.note = _NOTES[self._verdict] if self._verdict else ""
         self._verdict, self._last_command, self._is_paused = None, None, self._begins_paused
         status.control = Control.PERSON if self.demonstrates else Control.POLICY
-        if self._controls.read().leaves:  # all else that was pressed meanwhile was not meant for this attempt
-            raise PersonLeftError
+        self._controls.read()  # but to leave, what was pressed meanwhile was not meant for this attempt
         self._controls.reset()
         self._acts = self._is_called = self._stays = False
         self.gripper.reset()
@@ -170,14 +168,14 @@ class TeleopExpert(Expert):
         self._read()
         if self._is_paused and self._verdict is None:
             self._pause()
-        acts = self.demonstrates or self._wish.overrides or self._stays
+        acts = self.demonstrates or self._controls.overrides or self._stays
         self._acts = acts
         self._last_command = self._gripper_command() if acts else float(policy_action[-1])
         status.control = Control.PERSON if acts else Control.CALLED if self._is_called else Control.POLICY
         return acts
 
     def act(self) -> np.ndarray:
-        return self.mapping.vector(self._wish.action, self._gripper_command())
+        return self.mapping.vector(self._controls.action, self._gripper_command())
 
     def take_over(self) -> None:
         self._stays = True
@@ -204,31 +202,29 @@ class TeleopExpert(Expert):
         """What the person wants now."""
         if not self.window.is_open:
             raise PersonLeftError
-        self._wish = self._controls.read()
-        if self._wish.leaves:
-            raise PersonLeftError
-        self._is_paused ^= self._wish.toggles_pause
-        self._verdict = self._wish.verdict
+        self._controls.read()
+        self._is_paused ^= self._controls.toggles_pause
+        self._verdict = self._controls.verdict
 
     def _pause(self) -> None:
         """Nothing moves until the person goes on, takes over, or ends the attempt."""
         status = self._status
         note, status.note = status.note, _BEGIN if status.step == 0 else "Press Space to go on"
         while self._is_paused and self._verdict is None:
-            overrode = self._wish.overrides
+            overrode = self._controls.overrides
             status.control = Control.PAUSED
             self._show()
             time.sleep(1 / self.pace.fps)
             self._read()
-            self._is_paused &= overrode or not self._wish.overrides
+            self._is_paused &= overrode or not self._controls.overrides
         status.note = note
         self.pace.start()
 
     def _gripper_command(self) -> float:
         """1 closes, -1 opens: what the key or the teleoperator says, or else what it was."""
-        close = self.mapping.closes(self._wish.action)
-        if self._wish.toggles_gripper or close is None:
-            close = self.gripper.is_closed ^ self._wish.toggles_gripper
+        close = self.mapping.closes(self._controls.action)
+        if self._controls.toggles_gripper or close is None:
+            close = self.gripper.is_closed ^ self._controls.toggles_gripper
         return 1.0 if self.gripper.wish(close) else -1.0
 
     def _show(self, picture: np.ndarray | None = None) -> None:
