@@ -110,11 +110,6 @@ class SoundPicture:
         return self.width / (self.columns_per_frame * self.fps)
 
     @property
-    def n_frames(self) -> int:
-        """Whose sound is in the picture, wholly or in part."""
-        return -(-self.width // self.columns_per_frame)
-
-    @property
     def segment(self) -> int:
         """Samples behind one column: those of two columns, and no fewer than 0.04 s."""
         two = 2 * -(-self.samples_per_frame // self.columns_per_frame)
@@ -172,7 +167,7 @@ class SoundPicture:
         """What a frame's picture is.
 
         Args:
-            columns: (n, height) uint8, those of the episode up to this frame, or of its last `n_frames` frames.
+            columns: (n, height) uint8, those of the episode up to this frame, or of as many of its last frames as fill it.
 
         Returns:
             (height, width, 3) uint8.
@@ -224,7 +219,7 @@ class HeardSound:
 
     def __init__(self, picture: SoundPicture) -> None:
         self._how = picture
-        self._frames: deque[np.ndarray] = deque(maxlen=picture.n_frames)
+        self._frames: deque[np.ndarray] = deque(maxlen=-(-picture.width // picture.columns_per_frame))
         self._blocks: deque[np.ndarray] = deque(maxlen=-(-picture.context // picture.samples_per_frame))
 
     def clear(self) -> None:

@@ -91,15 +91,12 @@ class MicrophoneCameraConfig(CameraConfig):
         if self.source is None and len(given) != 1:
             seen = " and ".join(given) or "nothing"
             raise MicrophoneOptionError(f"A microphone has {seen}: give one of device, file and tone_hz. {_FIND}")
+        tone = self.tone_hz
         for name, wanted, is_good in (
             ("sample_rate", "Hz from 1000 to 384000", 1000 <= self.sample_rate <= 384_000),
             ("channel", "the card's channel, counted from 0", 0 <= self.channel < 256),
             ("gain_db", "dB from -60 to 60", -60 <= self.gain_db <= 60),
-            (
-                "tone_hz",
-                "Hz below half the sample_rate",
-                self.tone_hz is None or 0 < self.tone_hz < self.sample_rate / 2,
-            ),
+            ("tone_hz", "Hz below half the sample_rate", tone is None or 0 < tone < self.sample_rate / 2),
             ("low_db", f"at least -100, and below high_db={self.high_db}", -100 <= self.low_db < self.high_db <= 20),
         ):
             if not is_good:

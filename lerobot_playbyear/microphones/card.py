@@ -124,12 +124,14 @@ class CardRecording:
         samples = to_pcm_s16(chunk)
         with self._changed:
             self._note_burst(came_s)
-            self._put(samples, len(samples))
+            self._kept[self._places(len(samples))] = samples[-len(self._kept) :]
+            self.written += len(samples)
             is_sound = samples[::-1] != 0
             self._zeros = np.where(is_sound.any(axis=0), is_sound.argmax(axis=0), self._zeros + len(samples))
             lost = self._clock.note(self.written, came_s)
             if lost:  # known a quarter of a second later: then silence stands where sound goes on
-                self._put(np.zeros((0, samples.shape[1]), np.int16), lost)
+                self._kept[self._places(lost)] = 0
+                self.written += lost
                 self._bursts.clear()  # which seemed late
             self._changed.notify_all()
         if lost:
@@ -176,15 +178,9 @@ class CardRecording:
         """For how long a channel has given nothing but zeros [s]; no microphone in a room does."""
         return int(self._zeros[channel]) / self._rate
 
-    def _put(self, samples: np.ndarray, n: int) -> None:
-        """Writes the last `n` samples: those given, after silence."""
-        last = self.written + n
-        n_kept = min(n, len(self._kept))
-        block = np.zeros((n_kept, self._kept.shape[1]), np.int16)
-        if len(samples):
-            block[-len(samples) :] = samples[-n_kept:]
-        self._kept[np.arange(last - n_kept, last) % len(self._kept)] = block
-        self.written = last
+    def _places(self, n: int) -> np.ndarray:
+        """Where the next `n` samples lie in the ring; of more than it holds the last ones."""
+        return np.arange(self.written + max(n - len(self._kept), 0), self.written + n) % len(self._kept)
 
 
 class OpenCard:

@@ -122,7 +122,6 @@ class PlayedMicrophone(Microphone):
         super().__init__(name, sample_rate, samples.shape[1])
         self._samples = samples
         self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def _open(self) -> None:
         self._stop.clear()
@@ -131,9 +130,7 @@ class PlayedMicrophone(Microphone):
 
     def _close(self) -> None:
         self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        self._thread.join()
 
     def _play(self) -> None:
         size = max(round(CHUNK_S * self.sample_rate), 1)

@@ -105,9 +105,7 @@ def find_card(wanted: str | int, channels: int) -> SoundCard:
     cards = sound_cards()
     listed = "; ".join(f"{card.number}: {card.name}" for card in cards) or "none"
     text = str(wanted).strip()
-    if not text:
-        raise MicrophoneError(f"device='' of a microphone: name the sound card, of these: {listed}. {_FIND}")
-    found = cards_called(text, cards)
+    found = cards_called(text, cards) if text else []
     if len(found) != 1:
         what = "is not a sound card with an input" if not found else "fits more than one sound card"
         raise MicrophoneError(f"device={text!r} {what}. There are: {listed}. {_FIND}")
@@ -144,7 +142,6 @@ class PortAudioMicrophone(Microphone):
     def __init__(self, device: str | int, sample_rate: int, channels: int) -> None:
         super().__init__(f"the microphone {str(device)!r}", sample_rate, channels)
         self._device = device
-        self._stream: Any = None
 
     def _open(self) -> None:
         """PortAudio knows the cards that were there when it looked; where none of these can be opened, it looks again."""
@@ -191,12 +188,10 @@ class PortAudioMicrophone(Microphone):
         _open_streams.add(stream)
 
     def _close(self) -> None:
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            _open_streams.discard(stream)
-            with contextlib.suppress(Exception):  # of a card that is gone
-                stream.abort(ignore_errors=True)
-                stream.close(ignore_errors=True)
+        _open_streams.discard(self._stream)
+        with contextlib.suppress(Exception):  # of a card that is gone
+            self._stream.abort(ignore_errors=True)
+            self._stream.close(ignore_errors=True)
 
     def _take(self, chunk: np.ndarray, n: int, when: Any, status: Any) -> None:
         # PortAudio's own times are estimates that may be too early, and on ALSA they may stand at 0.

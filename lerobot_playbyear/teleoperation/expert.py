@@ -1,5 +1,6 @@
 """A person beside a policy, or alone: the expert of `--expert.type=teleop`."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -53,22 +54,20 @@ class Pace:
     ) -> None:
         self.fps = fps
         self._clock, self._sleep = clock, sleep
-        self._due: float | None = None
+        self._due = -math.inf
         self._times: deque[float] = deque()
 
     def start(self) -> None:
         """The next step is due at once; what was measured is forgotten."""
-        self._due = None
+        self._due = -math.inf
         self._times.clear()
 
     def wait(self) -> None:
         """Returns when the next step is due."""
         now = self._clock()
-        if self._due is None or now > self._due:
-            self._due = now
-        else:
+        if now < self._due:
             self._sleep(self._due - now)
-        self._due += 1 / self.fps
+        self._due = max(self._due, now) + 1 / self.fps
         self._times.append(self._clock())
         while self._times[-1] - self._times[0] > _RATE_OVER_S and len(self._times) > 2:
             self._times.popleft()
@@ -122,15 +121,11 @@ class TeleopExpert(Expert):
         self._verdict: Verdict | None = None
         self._last_command: float | None = None
         takeover = [] if demonstrates else [(key.title(), KEYS["Tab"] if toggles else "hold to take over")]
+        gripper = [("G", KEYS["G"])] if self.mapping.has_gripper else []
         ends = [(name, KEYS[name]) for name in ("Space", "S", "F", "Enter", "R", "Esc")]
         self._status = Status(
             fps=self.clock_fps,
-            keys=[
-                *takeover,
-                *_MOVING_KEYS.get(kind, []),
-                *([("G", KEYS["G"])] if self.mapping.has_gripper else []),
-                *ends,
-            ],
+            keys=[*takeover, *_MOVING_KEYS.get(kind, []), *gripper, *ends],
             waiting="The next attempt is being prepared" if demonstrates else "The policy is learning or evaluated",
         )
         self.window.show(self._status)

@@ -54,15 +54,13 @@ class Speaker:
             return
         try:
             import sounddevice  # type: ignore[import-not-found, import-untyped, unused-ignore]
-        except ImportError:
-            self.problem = "pip install sounddevice"
-            return
-        except OSError:
-            self.problem = "PortAudio is missing (Debian: libportaudio2)"
-            return
-        try:
+
             self._stream = sounddevice.OutputStream(sample_rate, channels=1, dtype="float32", callback=self._fill)
             self._stream.start()
+        except ImportError:
+            self.problem = "pip install sounddevice"
+        except OSError:
+            self.problem = "PortAudio is missing (Debian: libportaudio2)"
         except Exception as error:  # whatever a sound card may say, work goes on without
             self.problem = f"no sound card ({str(error).splitlines()[0]})"
             self.close()

@@ -160,12 +160,12 @@ def show_window(title: str, connection: Connection) -> None:
     try:
         import glfw
         from OpenGL import GL
+
+        glfw.ERROR_REPORTING = False  # type: ignore[assignment, unused-ignore]
+        screen = Screen(glfw, GL, title)
     except ImportError as error:
         connection.send(f"{error}; pip install glfw PyOpenGL")
         return
-    glfw.ERROR_REPORTING = False  # type: ignore[assignment, unused-ignore]
-    try:
-        screen = Screen(glfw, GL, title)
     except Exception as error:  # whatever the screen or OpenGL may say belongs into the message
         connection.send(str(error) or type(error).__name__)
         return
