@@ -90,17 +90,13 @@ def read_tracks(dataset: DatasetReader, start_time_s: float | None = None) -> li
             )
         heard = [key for key, own in features.items() if own["dtype"] == AUDIO_DTYPE]
         tracks = [_track(dataset, key, features[key], template, start_time_s) for key in heard]
-        _check_names(tracks, set(features))
-    return tracks
-
-
-def _check_names(tracks: list[AudioTrack], features: set[str]) -> None:
-    taken = features - {track.key for track in tracks}
+    taken = features.keys() - set(heard)
     for track in tracks:
         for name in column_names(track):
             if name in taken:
                 raise InputError(f"'{track.key}' becomes '{name}', which is there already. Rename one of them.")
             taken.add(name)
+    return tracks
 
 
 def column_names(track: AudioTrack) -> list[str]:

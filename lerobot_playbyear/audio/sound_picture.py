@@ -333,8 +333,7 @@ def read_pictures(path: str | Path) -> list[SoundPicture]:
     path = Path(path)
     file = path / INFO_PATH if path.is_dir() else path
     try:
-        features = parse_json(file.read_text())["features"]
-        pictures = pictures_of(features)
+        pictures = pictures_of(parse_json(file.read_text())["features"])
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         if isinstance(error, InputError):
             raise

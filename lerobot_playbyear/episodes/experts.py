@@ -141,10 +141,8 @@ class ScriptedDemonstrator(Expert):
 
     judges = False
 
-    def __init__(self) -> None:
-        self._script = Script()
-
     def reset(self, env: gym.Env) -> None:
+        self._script = Script()
         self._script.reset(env)
         self._acts = False
 

@@ -12,7 +12,6 @@ import json
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -99,7 +98,7 @@ class PageWriter(contextlib.ExitStack):
             "facts": facts(self._dataset),
             "episodes": self._index,
             "cameras": self._dataset.cameras,
-            "microphones": [asdict(microphone) for microphone in self._data.microphones],
+            "microphones": self._data.microphones,
             "gain": self._data.gain,
             "curves": self._data.curves,
             "summary": summary(findings),
@@ -149,32 +148,16 @@ def _json(value: Any) -> str:
 # What is drawn
 
 
-@dataclass(frozen=True)
-class Microphone:
-    """How a microphone is drawn, the same in all episodes.
-
-    Args:
-        key: Its feature.
-        sample_rate: [Hz].
-        peak: Loudest sample of the dataset, as a share of full scale.
-        top_db: Level of the brightest colour [dBFS].
-        bottom_db: Level of the darkest colour [dBFS].
-        top_hz: Highest frequency drawn.
-    """
-
-    key: str
-    sample_rate: int
-    peak: float
-    top_db: float
-    bottom_db: float
-    top_hz: float
-
-
 class EpisodeData:
     """Prepares the drawings of one episode after another.
 
     Args:
         dataset: The dataset; drawn are the microphones whose rows are what their sample rate says.
+
+    Attributes:
+        microphones: How each is drawn, the same in all episodes: `key`, its feature; `sample_rate` [Hz]; `peak`, the loudest
+            sample of the dataset as a share of full scale; `top_db` and `bottom_db`, levels of the brightest and of the darkest
+            colour [dBFS]; `top_hz`, the highest frequency drawn [Hz].
     """
 
     def __init__(self, dataset: SurveyedDataset) -> None:
@@ -184,7 +167,7 @@ class EpisodeData:
     @cached_property
     def gain(self) -> float:
         """By how much sound is amplified when it is played, the same in all episodes."""
-        return gain_of(max((microphone.peak for microphone in self.microphones), default=1.0))
+        return gain_of(max((microphone["peak"] for microphone in self.microphones), default=1.0))
 
     @cached_property
     def curves(self) -> list[dict[str, Any]]:
@@ -212,7 +195,7 @@ class EpisodeData:
 
     def sound(self, episode: EpisodeRows) -> list[np.ndarray]:
         """What each microphone heard, in steps of 16-bit PCM."""
-        return [heard(self._dataset, microphone.key, episode) for microphone in self.microphones]
+        return [heard(self._dataset, microphone["key"], episode) for microphone in self.microphones]
 
     def draw(self, episode: EpisodeRows) -> dict[str, Any]:
         """Everything but the film, for JSON."""
@@ -229,14 +212,14 @@ class EpisodeData:
         """The level of the first microphone over the episode, 0 to 99 of its loudest, for the list of episodes."""
         if not self.microphones:
             return []
-        sound = heard(self._dataset, self.microphones[0].key, episode)
+        sound = heard(self._dataset, self.microphones[0]["key"], episode)
         level = block_levels(sound, len(sound) // len(episode))
         edges = np.linspace(0, len(level), min(_PREVIEW_COLUMNS, len(level)) + 1).astype(int)
         level = np.maximum.reduceat(level, edges[:-1])
         share = 1 + (level - level.max()) / _PREVIEW_RANGE_DB
         return np.clip(99 * share, 0, 99).astype(int).tolist()
 
-    def _measure(self, key: str) -> Microphone:
+    def _measure(self, key: str) -> dict[str, Any]:
         dataset = self._dataset
         rate = sample_rate_of(dataset.features[key]["shape"][0], dataset.fps)
         episodes = dataset.episodes[:: max(len(dataset.episodes) // _SAMPLED_EPISODES, 1)]
@@ -245,18 +228,20 @@ class EpisodeData:
         top = float(np.ceil(levels.max() / 5) * 5)
         bottom = float(np.floor(np.quantile(levels, _DARKEST_SHARE) / 5) * 5)
         bottom = min(max(bottom, top - _LARGEST_RANGE_DB), top - 5)
-        return Microphone(key, rate, peak, top, bottom, top_hz=min(TOP_FREQUENCY, rate / 2))
+        drawn = {"top_db": top, "bottom_db": bottom, "top_hz": min(TOP_FREQUENCY, rate / 2)}
+        return {"key": key, "sample_rate": rate, "peak": peak, **drawn}
 
-    def _draw_sound(self, microphone: Microphone, samples: np.ndarray) -> dict[str, Any]:
-        levels, hop_s = _levels(samples, microphone.sample_rate)  # (columns, bins)
-        share = (levels - microphone.bottom_db) / (microphone.top_db - microphone.bottom_db)
+    def _draw_sound(self, microphone: dict[str, Any], samples: np.ndarray) -> dict[str, Any]:
+        rate, bottom = microphone["sample_rate"], microphone["bottom_db"]
+        levels, hop_s = _levels(samples, rate)  # (columns, bins)
+        share = (levels - bottom) / (microphone["top_db"] - bottom)
         grey = np.clip(np.round(share * (_GREY_LEVELS - 1)), 0, _GREY_LEVELS - 1) * (255 // (_GREY_LEVELS - 1))
-        onsets = sudden_sounds(samples, microphone.sample_rate)
+        onsets = sudden_sounds(samples, rate)
         frame_s = 1 / self._dataset.fps  # the first block was heard before the first picture
         return {
             "spectrogram": _png(grey.astype(np.uint8).T[::-1]),
             "hop": hop_s,
-            "wave": _base64(_envelope(samples, max(microphone.peak * FULL_SCALE, 1.0))),
+            "wave": _base64(_envelope(samples, max(microphone["peak"] * FULL_SCALE, 1.0))),
             "onsets": [round(float(time) - frame_s, 4) for time in onsets],
         }
 

@@ -139,7 +139,7 @@ def check_sound(dataset: SurveyedDataset, key: str) -> Iterator[Finding]:
     levels, peak, worst_offset = [], 0.0, 0.0
     for episode in dataset.episodes:
         samples = heard(dataset, key, episode)
-        mean = float(samples.mean(dtype=np.float64))
+        mean = float(samples.mean(dtype=np.float64)) / FULL_SCALE
         levels.append(dbfs(float(samples.std(dtype=np.float64))))
         peak = max(peak, float(np.abs(samples).max()))
         if samples.min() == samples.max():
@@ -147,7 +147,6 @@ def check_sound(dataset: SurveyedDataset, key: str) -> Iterator[Finding]:
             continue
         if levels[-1] < _QUIET_DBFS:
             quiet.append(episode.index)
-        mean /= FULL_SCALE
         worst_offset = max(worst_offset, abs(mean))
         if abs(mean) > _OFFSET:
             offset.append(episode.index)
@@ -165,12 +164,10 @@ def check_sound(dataset: SurveyedDataset, key: str) -> Iterator[Finding]:
     if not dead and not quiet:
         yield Finding("silence", "ok", span, key, figures=figures)
     yield cut.verdict("clipping", "cut peaks", "no peak is cut")
+    message = f"mean at most {worst_offset:.2%} of full scale"
     if offset:
         message = f"{name_episodes(offset)}: mean up to {worst_offset:.1%} of full scale; a high-pass filter removes it"
-        yield Finding("DC offset", "warning", message, key, offset, {"largest": worst_offset})
-    else:
-        message = f"mean at most {worst_offset:.2%} of full scale"
-        yield Finding("DC offset", "ok", message, key, figures={"largest": worst_offset})
+    yield Finding("DC offset", "warning" if offset else "ok", message, key, offset, {"largest": worst_offset})
     yield lost.verdict("drop-outs", "spans without a sample that changes", "no gap in live sound")
     yield repeated.verdict("repeated blocks", "spans that copy the block before", "no block came twice")
 

@@ -47,14 +47,11 @@ def check_lengths(dataset: SurveyedDataset) -> Iterator[Finding]:
     text = f"{least:.4g} to {most:.4g} s, median {usual:.4g} s"
     single = [e.index for e in dataset.episodes if len(e) < 2]
     odd = [e.index for e in dataset.episodes if not median / _LENGTH_FACTOR <= len(e) <= median * _LENGTH_FACTOR]
-    if single:
-        message = f"{name_episodes(single)}: a single frame; {text}"
-        yield Finding("episode lengths", "warning", message, episodes=single, figures=figures)
-    elif odd:
-        message = f"{name_episodes(odd)}: over {_LENGTH_FACTOR:g} times shorter or longer than the median; {text}"
-        yield Finding("episode lengths", "warning", message, episodes=odd, figures=figures)
-    else:
-        yield Finding("episode lengths", "ok", text, figures=figures)
+    wrong = single or odd
+    if wrong:
+        reason = "a single frame" if single else f"over {_LENGTH_FACTOR:g} times shorter or longer than the median"
+        text = f"{name_episodes(wrong)}: {reason}; {text}"
+    yield Finding("episode lengths", "warning" if wrong else "ok", text, episodes=wrong, figures=figures)
 
 
 def check_sample_rates(dataset: SurveyedDataset) -> Iterator[Finding]:

@@ -35,15 +35,14 @@ class CardClock:
     A chunk may come late and never early. So the earliest of the last second's, as if the card's rate were exact, tells when
     samples come; it follows a clock that is fast or slow, and a chunk that comes late changes nothing. A burst of chunks that
     were held up ends with one that is not late. Where all chunks of a quarter of a second come late by more than
-    `tolerance_s`, samples were lost.
+    10 ms, samples were lost.
 
     Args:
         sample_rate: What the card says [Hz].
-        tolerance_s: What is no loss [s].
     """
 
-    def __init__(self, sample_rate: int, tolerance_s: float) -> None:
-        self._rate, self._tolerance = sample_rate, tolerance_s
+    def __init__(self, sample_rate: int) -> None:
+        self._rate = sample_rate
         # Last sample's number + 1, and when sample 0 came by it [s]: only those that no later one undercuts, so the first is
         # the earliest of the last second.
         self._offsets: deque[tuple[int, float]] = deque()
@@ -57,7 +56,7 @@ class CardClock:
             How many samples were lost before; the caller counts them as written.
         """
         offset = came_s - n_written / self._rate
-        if self._offsets and offset - self._start > self._tolerance:
+        if self._offsets and offset - self._start > _LATE_S:
             return self._note_late(n_written, offset, came_s)
         self._late = []
         self._keep(n_written, offset)
@@ -110,7 +109,7 @@ class CardRecording:
 
     def __init__(self, name: str, sample_rate: int, channels: int) -> None:
         self._name, self._rate = name, sample_rate
-        self._clock = CardClock(sample_rate, tolerance_s=_LATE_S)
+        self._clock = CardClock(sample_rate)
         self._changed = threading.Condition()
         self._kept = np.zeros((round(KEPT_S * sample_rate), channels), np.int16)  # a ring, by number of sample
         self.written = 0
@@ -184,14 +183,16 @@ class CardRecording:
 
 
 class OpenCard:
-    """A card that listens, for all microphones that are its channels.
+    """A card that listens, for all microphones that are its channels; as much of its sound is there as a strip takes.
+
+    A card that brings nothing is opened once more: through a sound server a stream that was opened now and then never begins.
 
     Args:
         config: Of one of them.
         channels: How many to open, at least.
 
     Raises:
-        MicrophoneError: It has fewer.
+        MicrophoneError: It has fewer, or cannot be opened, or nothing comes from it.
     """
 
     def __init__(self, config: "MicrophoneCameraConfig", channels: int) -> None:
@@ -206,9 +207,6 @@ class OpenCard:
         self._readers: set[int] = set()  # in this control step
         self._lock = threading.Lock()
 
-    def open(self) -> None:
-        """Listens, and waits until a strip's sound is there. A card that brings nothing is opened once more: through a sound
-        server a stream that was opened now and then never begins."""
         enough = n_kept(self.microphone.sample_rate) + round(2 * CHUNK_S * self.microphone.sample_rate)
         try:
             self.microphone.connect(self.recording.write)
@@ -253,7 +251,6 @@ def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int]) -> Open
         card = _open_cards.get(config.card)
         if card is None:
             card = OpenCard(config, max(channels) + 1)
-            card.open()
             _open_cards[config.card] = card
         if card.microphone.problem:
             raise MicrophoneError(

@@ -121,9 +121,8 @@ def described(card: SoundCard, rates: tuple[int, ...], cards: list[SoundCard]) -
 def level_text(samples: np.ndarray) -> str:
     """How loud each channel is: (n, channels) int16 as bars from -60 dB to full scale."""
     texts = []
-    for number in range(samples.shape[1]):
-        channel = samples[:, number].astype(np.float64)
-        loudest = float(np.abs(channel).max()) if len(channel) else 0.0
+    for number, channel in enumerate(samples.T.astype(np.float64)):
+        loudest = float(np.abs(channel).max(initial=0))
         level = max(20 * np.log10(loudest / 32768), _QUIETEST_DB) if loudest else _QUIETEST_DB
         bar = "#" * round(_BAR * (level - _QUIETEST_DB) / -_QUIETEST_DB)
         said = "clips" if loudest >= _CLIPPED else f"{level:.0f} dB" if loudest else "zeros"

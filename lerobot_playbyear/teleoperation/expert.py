@@ -117,7 +117,6 @@ class TeleopExpert(Expert):
         key, toggles = options.takeover_key.lower(), options.takeover == "toggle"
         self._controls = Controls(teleop, window.keys, toggles, key)
         self._begins_paused = options.begin_paused
-        self._is_called = self._stays = False
         self._verdict: Verdict | None = None
         self._last_command: float | None = None
         takeover = [] if demonstrates else [(key.title(), KEYS["Tab"] if toggles else "hold to take over")]

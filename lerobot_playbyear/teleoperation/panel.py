@@ -103,7 +103,11 @@ def draw(status: Status) -> np.ndarray:
         y += 22
         wait = f", changes in {status.cooldown_s:.1f} s" if status.cooldown_s > 0 else ""
         _draw_fact(canvas, y, "Gripper", status.gripper + wait)
-    _draw_pace(canvas, status, y + 22)
+    if status.is_slow:
+        slow = f"slow: {status.achieved_fps:.0f} of {status.fps:.0f} steps/s"
+        _draw_fact(canvas, y + 22, "Pace", slow, _WARNING)
+    elif status.fps:
+        _draw_fact(canvas, y + 22, "Pace", f"{status.fps:.0f} steps/s")
     keys = _keys(tuple(status.keys))
     image.paste(keys, (_LEFT, SIZE[1] - 18 - keys.height))
     return np.asarray(image)
@@ -152,13 +156,6 @@ def _draw_history(draw: ImageDraw.ImageDraw, levels: list[float], n_shown: int, 
         left, right = round(_RIGHT + 1 - (age + 1) * step), round(_RIGHT + 1 - age * step) - 1
         top = y + height - round(height * (1 - level / FLOOR_DB))
         draw.rectangle((left, top, max(right, left), y + height), fill=_BAR)
-
-
-def _draw_pace(draw: ImageDraw.ImageDraw, status: Status, y: int) -> None:
-    if status.is_slow:
-        _draw_fact(draw, y, "Pace", f"slow: {status.achieved_fps:.0f} of {status.fps:.0f} steps/s", _WARNING)
-    elif status.fps:
-        _draw_fact(draw, y, "Pace", f"{status.fps:.0f} steps/s")
 
 
 def _draw_fact(draw: ImageDraw.ImageDraw, y: int, name: str, value: str, colour: str = _DIM) -> None:
