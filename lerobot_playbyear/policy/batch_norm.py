@@ -24,15 +24,10 @@ def mean_over_processes(values: Tensor) -> Tensor:
 
 
 def share_batch_norm(network: nn.Module) -> None:
-    """Makes every `nn.BatchNorm2d` in a network one of all processes; the names in its `state_dict` stay."""
-    for parent in list(network.modules()):
-        for name, norm in parent.named_children():
-            if type(norm) is nn.BatchNorm2d:
-                shared = SharedBatchNorm2d(
-                    norm.num_features, norm.eps, norm.momentum, norm.affine, norm.track_running_stats
-                )
-                shared.load_state_dict(norm.state_dict())
-                parent.register_module(name, shared)
+    """Makes every `nn.BatchNorm2d` in a network one of all processes, with the parameters and statistics that it has."""
+    for norm in network.modules():
+        if type(norm) is nn.BatchNorm2d:
+            norm.__class__ = SharedBatchNorm2d
 
 
 class SharedBatchNorm2d(nn.BatchNorm2d):

@@ -50,8 +50,7 @@ def with_hearing(card: ModelCard, config: PlaybyearConfig) -> ModelCard:
     """
     tags = {"audio", "multimodal"} if config.use_audio and config.audio_keys else set()
     card.data["tags"] = sorted({*card.data.get("tags", []), *tags})
-    section = _section(config)
-    card.text = card.text.replace(_BEFORE, f"{section}\n\n{_BEFORE}", 1)
+    card.text = card.text.replace(_BEFORE, f"{_section(config)}\n\n{_BEFORE}", 1)
     return card
 
 
@@ -68,22 +67,15 @@ def _section(config: PlaybyearConfig) -> str:
         ("Memory", f"{config.memory_steps} steps, {config.frame_stack} images each" if config.use_memory else "none"),
     ]
     name = config.repo_id or "<user>/<name>"
-    return "\n".join(
-        [
-            "## Hearing",
-            "",
-            "An audio-visual LSTM after *Play it by Ear* (Du et al., RSS 2022). LeRobot runs it where its plugin "
-            "`lerobot_policy_playbyear` is installed, and finds that by itself.",
-            "",
-            "| | |",
-            "|---|---|",
-            *(f"| {what} | {value} |" for what, value in rows if value),
-            "",
-            "In simulation, with the tasks of `lerobot_env_playbyear`:",
-            "",
-            f"```bash\nlerobot-eval --policy.path={name} --env.type=playbyear --env.task=OccludedGrasp-v1\n```",
-        ]
+    paragraphs = (
+        "## Hearing",
+        "An audio-visual LSTM after *Play it by Ear* (Du et al., RSS 2022). LeRobot runs it where its plugin "
+        "`lerobot_policy_playbyear` is installed, and finds that by itself.",
+        "\n".join(["| | |", "|---|---|", *(f"| {what} | {value} |" for what, value in rows if value)]),
+        "In simulation, with the tasks of `lerobot_env_playbyear`:",
+        f"```bash\nlerobot-eval --policy.path={name} --env.type=playbyear --env.task=OccludedGrasp-v1\n```",
     )
+    return "\n\n".join(paragraphs)
 
 
 def _facts(meta: Any) -> SimpleNamespace:

@@ -15,14 +15,13 @@ from torchvision.models import ResNet
 
 from lerobot_playbyear.compat import BasicBlock, n_changes
 from lerobot_playbyear.policy.networks import VisionEncoder
-from lerobot_playbyear.policy.optimization import computes_512_bits
+from lerobot_playbyear.policy.optimization import HAS_512_BITS
 
 _PAIRS = (("conv1", "bn1"), ("conv2", "bn2"))  # torchvision's names in a ResNet and in its blocks
 _SMALLEST = 32  # pixels: their last maps are 1x1, whose order in memory oneDNN cannot tell
 _SINGLE_PIXELS = 16  # stacks up to this size are single pixels before the last stage
 _IN_CACHE = 16  # stacks of small pictures that a processor's cache holds
 _SAFE_EMBEDDING = 64  # 8 channels in the first stage, and multiples of them
-_HAS_512_BITS = computes_512_bits()
 
 
 def act_by_folded_copies(network: nn.Module) -> None:
@@ -48,10 +47,7 @@ class FoldedVisionEncoder(VisionEncoder):
     """
 
     def __init__(self, plain: VisionEncoder) -> None:
-        nn.Module.__init__(self)
-        self.embedding_size, self.network = plain.embedding_size, plain.network
-        self.register_buffer("mean", plain.mean, persistent=False)
-        self.register_buffer("std", plain.std, persistent=False)
+        vars(self).update(vars(plain))
         self._folded = FoldedCopy()  # no part of a checkpoint
 
     def forward(self, stacks: Tensor) -> Tensor:
@@ -67,7 +63,7 @@ class FoldedVisionEncoder(VisionEncoder):
     def normalize(self, stacks: Tensor) -> Tensor:
         """The same as channels_last, a few stacks at a time."""
         on_cpu = stacks.device.type == "cpu"
-        if on_cpu and self.embedding_size % _SAFE_EMBEDDING and not _HAS_512_BITS:
+        if on_cpu and self.embedding_size % _SAFE_EMBEDDING and not HAS_512_BITS:
             return super().normalize(stacks)  # oneDNN writes gradients of 4 channels beyond their memory (torch 2.11)
         # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
         normalized = torch.empty_like(stacks, memory_format=torch.channels_last)

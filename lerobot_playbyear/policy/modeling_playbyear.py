@@ -227,8 +227,7 @@ class RecentFrames:
 
     def __init__(self, config: PlaybyearConfig) -> None:
         self._config = config
-        self._images: dict[str, deque[Tensor]] = {}
-        self._sound: dict[str, Tensor] = {}
+        self._frames: dict[str, deque[Tensor]] = {}
         self._n_heard = 0
 
     def add(self, frame: dict[str, Tensor], prepare_images: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
@@ -242,23 +241,20 @@ class RecentFrames:
             What one encoding needs, as a batch of runs of one frame.
         """
         config = self._config
-        run: dict[str, Tensor] = {}
+        run = {key: frame[key].unsqueeze(1) for key in config.low_dimensional_keys}
         for key in config.camera_keys if config.use_vision else ():
             image = prepare_images(frame[key].unsqueeze(1)).squeeze(1)  # (B, 3, size, size)
-            buffer = self._images.setdefault(key, deque([image] * config.frame_stack, maxlen=config.frame_stack))
-            buffer.append(image)
-            run[key] = torch.stack(list(buffer), dim=1)  # (B, frame_stack, 3, size, size)
-        if config.use_audio:
-            self._n_heard = min(self._n_heard + 1, config.audio_frames)
+            run[key] = self._latest(key, image, image, config.frame_stack)
+        self._n_heard = min(self._n_heard + 1, config.audio_frames)
         for key in config.audio_keys if config.use_audio else ():
             sound = newest({key: frame[key].unsqueeze(1)}, key, 1, config.feature_shape(key)).squeeze(1)  # (B, S)
-            earlier = self._sound.get(key)
-            if earlier is None:
-                earlier = sound.new_zeros(sound.shape[0], sound.shape[1] * config.audio_frames)
-            self._sound[key] = torch.cat([earlier[:, sound.shape[1] :], sound], dim=1)
-            run[key] = self._sound[key].unflatten(1, (config.audio_frames, -1))
+            run[key] = self._latest(key, sound.clone(), torch.zeros_like(sound), config.audio_frames)
             is_pad = torch.arange(config.audio_frames, device=sound.device) < config.audio_frames - self._n_heard
             run[f"{key}_is_pad"] = is_pad.expand(sound.shape[0], -1)
-        for key in config.low_dimensional_keys:
-            run[key] = frame[key].unsqueeze(1)
         return run
+
+    def _latest(self, key: str, frame: Tensor, before: Tensor, n: int) -> Tensor:
+        """The last n frames of a key, (B, n, ...), up to this one; `before` stands for those before the episode."""
+        frames = self._frames.setdefault(key, deque([before] * n, maxlen=n))
+        frames.append(frame)
+        return torch.stack(list(frames), dim=1)

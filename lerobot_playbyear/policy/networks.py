@@ -17,11 +17,9 @@ from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads, weights_of
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
 from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
-from lerobot_playbyear.policy.optimization import computes_512_bits
+from lerobot_playbyear.policy.optimization import HAS_512_BITS
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
-
-_HAS_512_BITS = computes_512_bits()
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
@@ -314,16 +312,12 @@ class MemoryHead(nn.Module):
         """What is kept of frames: their joint encodings (N, embedding size), and with displacements what was felt, (N, D)."""
         return torch.cat([fused, *felt], dim=-1) if self.displacement_gain else fused
 
-    def forward(self, encodings: Tensor) -> Tensor:
-        """The action after every full window of consecutive frames, (B, n, D).
+    def recall(self, encodings: Tensor) -> Tensor:
+        """The memory's output after every full window of consecutive frames, (B, n, D).
 
         Returns:
-            (B, K, n_actions) with K = n - H + 1, in [-1, 1] times the action range.
+            (B, K, embedding size) with K = n - H + 1.
         """
-        return self.act(self.recall(encodings))
-
-    def recall(self, encodings: Tensor) -> Tensor:
-        """(B, n, D) consecutive frames -> (B, K, embedding size), the memory's output after every full window."""
         windows = encodings.unfold(1, self.memory_steps, 1).transpose(2, 3)  # (B, K, H, D)
         if self.displacement_gain:
             felt = windows[..., self.n_fused :]
@@ -337,13 +331,13 @@ class MemoryHead(nn.Module):
 
     def _remember(self, windows: Tensor) -> Tensor:
         """(N, H, D) -> (N, H, embedding size). Not in bfloat16 where oneDNN has no LSTM in it: on CPUs without AVX-512."""
-        if windows.device.type == "cpu" and not _HAS_512_BITS:
+        if windows.device.type == "cpu" and not HAS_512_BITS:
             with torch.autocast("cpu", enabled=False):
                 return self.lstm(windows.to(next(self.lstm.parameters()).dtype))[0]
         return self.lstm(windows)[0]
 
     def act(self, memories: Tensor) -> Tensor:
-        """(..., embedding size) of `recall` -> (..., n_actions)."""
+        """(..., embedding size) of `recall` -> (..., n_actions), in [-1, 1] times the action range."""
         actions = self.head(memories.flatten(0, -2)).float()  # whatever autocast computed in
         actions = self.action_range * torch.tanh(actions / self.action_range)
         return actions.unflatten(0, memories.shape[:-1])

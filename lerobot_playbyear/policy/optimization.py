@@ -47,14 +47,13 @@ def computes_bfloat16() -> bool:
     return _has_any("avx512_bf16", "amx_bf16")
 
 
-def computes_512_bits() -> bool:
-    """Whether this CPU has AVX-512."""
-    return _has_any("avx512_f")
-
-
 def _has_any(*names: str) -> bool:
     capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
     return any(capabilities.get(name, False) for name in names)
+
+
+HAS_512_BITS = _has_any("avx512_f")
+"""Whether this CPU has AVX-512."""
 
 
 def _computes(kind: str, dtype: str) -> bool:

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.processor import (
-    PolicyAction,
     PolicyProcessorPipeline,
     ProcessorStep,
     ProcessorStepRegistry,
@@ -32,9 +31,7 @@ _PACE_STEPS = slice(2, 22)
 
 def make_playbyear_pre_post_processors(
     config: PlaybyearConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
-) -> tuple[
-    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
-]:
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Builds both pipelines.
 
     Only the low-dimensional observations and the action are normalised. Images and waveforms reach the network as they
@@ -109,9 +106,15 @@ class MicrophonePicturesToAudioStep(SoundStep):
         return {**observation, **{key: self._sound(key, observation) for key in missing}}
 
     def _sound(self, key: str, observation: dict) -> Tensor:
-        picture = observation.get(PICTURE_PREFIX + key.removeprefix(AUDIO_PREFIX))
+        name = key.removeprefix(AUDIO_PREFIX)
+        picture = observation.get(PICTURE_PREFIX + name)
         if not isinstance(picture, Tensor) or picture.ndim < 3:
-            raise InputError(self._missing(key, observation))
+            cameras = [one.removeprefix(PICTURE_PREFIX) for one in observation if one.startswith(PICTURE_PREFIX)]
+            raise InputError(
+                f"This policy hears '{name}', and there is neither '{key}' nor a camera '{name}' in the observation; the "
+                f"cameras are {', '.join(cameras) or 'none'}. On a robot give the microphone that name: "
+                f"--robot.cameras='{{{name}: {{type: microphone, device: ...}}}}' (playbyear-find-microphones prints it)."
+            )
         pictures = picture if picture.ndim == 4 else picture[None]  # (B, 3, H, W)
         blocks = [self._block(key, number, self._strip(key, one)) for number, one in enumerate(pictures)]
         return torch.from_numpy(np.stack(blocks).astype(np.float32) / 32768).to(picture.device)
@@ -126,18 +129,14 @@ class MicrophonePicturesToAudioStep(SoundStep):
                 f"This policy hears '{name}', and the picture '{PICTURE_PREFIX}{name}' carries no samples: it is another "
                 f"camera's, or was compressed or resized. Give --robot.cameras='{{{name}: {{type: microphone, device: ...}}}}'."
             )
-        if self._column_rate(strip.sample_rate) != self.sample_rate:
-            fitting = [rate for rate in _USUAL_RATES if self._column_rate(rate) == self.sample_rate]
+        if nearest_sample_rate(strip.sample_rate, self.fps) != self.sample_rate:  # the one that it has in a dataset
+            fitting = [rate for rate in _USUAL_RATES if nearest_sample_rate(rate, self.fps) == self.sample_rate]
             raise InputError(
                 f"The microphone '{name}' has sample_rate={strip.sample_rate}, and this policy was trained with "
                 f"{self.sample_rate} Hz at {self.fps} frames per second: give sample_rate={(*fitting, self.sample_rate)[0]} in "
                 "--robot.cameras."
             )
         return strip
-
-    def _column_rate(self, sample_rate: int) -> int:
-        """The rate that a microphone's sound has in a dataset [Hz]."""
-        return nearest_sample_rate(sample_rate, self.fps)
 
     def _block(self, key: str, number: int, strip: Strip) -> np.ndarray:
         sound = self._sounds.setdefault((key, number), ControlStepSound(samples_per_frame(self.sample_rate, self.fps)))
@@ -153,15 +152,6 @@ class MicrophonePicturesToAudioStep(SoundStep):
         if len(self._spacing) == _PACE_STEPS.stop:
             misfit = "The control loop does not fit the policy: "
             check_pace(self._spacing[_PACE_STEPS], sample_rate, self.fps, "the policy", misfit, is_live=True)
-
-    def _missing(self, key: str, observation: dict) -> str:
-        name = key.removeprefix(AUDIO_PREFIX)
-        cameras = ", ".join(one.removeprefix(PICTURE_PREFIX) for one in observation if one.startswith(PICTURE_PREFIX))
-        return (
-            f"This policy hears '{name}', and there is neither '{key}' nor a camera '{name}' in the observation; the cameras "
-            f"are {cameras or 'none'}. On a robot give the microphone that name: "
-            f"--robot.cameras='{{{name}: {{type: microphone, device: ...}}}}' (playbyear-find-microphones prints it)."
-        )
 
 
 @dataclass
