@@ -253,12 +253,12 @@ def test_a_folder_that_cannot_be_written_is_named_and_an_unreadable_dataset_is_n
     assert_same(load(noise, tmp_path / "cache"), in_memory(noise))
 
 
-def test_auto_takes_memory_while_the_frames_fit(noise, monkeypatch):
-    reader = DatasetReader("tests/noise", noise)
-    assert store_module.choose_place("auto", reader) == "memory"
-    monkeypatch.setattr(store_module, "available_memory", lambda: 100_000)
-    assert store_module.choose_place("auto", reader) == "disk"
-    assert store_module.choose_place("memory", reader) == "memory"
+def test_auto_takes_memory_while_the_frames_fit(noise, tmp_path, monkeypatch):
+    assert in_memory(noise, place="auto").place == "memory"
+    n_bytes = in_memory(noise).nbytes
+    monkeypatch.setattr(store_module, "available_memory", lambda: 2 * n_bytes - 1000)
+    assert in_memory(noise, place="auto", cache=tmp_path).place == "disk"
+    assert in_memory(noise).place == "memory"
 
 
 # Sound at another rate

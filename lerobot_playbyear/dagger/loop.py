@@ -181,12 +181,7 @@ class Loop:
     def _note(self, episode: Episode, outcome: str, spent: Seconds) -> None:
         assert episode.interventions is not None
         self.method.note(episode, outcome)
-        figures = {
-            "seed": episode.seed,
-            "n_frames": len(episode),
-            "success": episode.success,
-            "outcome": outcome,
-        }
+        figures = {"seed": episode.seed, "n_frames": len(episode), "success": episode.success, "outcome": outcome}
         self._count(figures | self._cost(episode.interventions) | _rounded(spent))
 
     def _count(self, figures: dict[str, Any]) -> None:

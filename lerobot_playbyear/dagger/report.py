@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ class Report(Progress):
         state: The run's counters, which are only read, and its name in W&B, which is gone on with or noted.
 
     Attributes:
-        totals: What all attempts of the run cost so far.
+        totals: What all attempts of the run cost so far, as `totals_of` says it.
     """
 
     def __init__(self, cfg: DaggerConfig, training: PlaybyearTrainConfig, folder: RunFolder, state: RunState) -> None:
@@ -37,7 +36,7 @@ class Report(Progress):
         self._cfg, self._folder, self._state = cfg, folder, state
         self.success = state.success
         self._lines = folder.metrics()
-        self.totals = Totals.of(self._lines)
+        self.totals = totals_of(self._lines)
 
     def doing(self, what: str) -> None:
         """What the run is at, behind the bar."""
@@ -46,13 +45,13 @@ class Report(Progress):
         needed = state.attempts - state.unneeded - state.discarded
         expert = f", expert needed in {needed / state.attempts:.0%} of {state.attempts}" if state.attempts else ""
         if state.attempts:
-            expert += f" ({self.totals.expert_steps} steps), autonomy {self.totals.autonomy:.0%}"
+            expert += f" ({self.totals['expert_steps']} steps), autonomy {self.totals['autonomy']:.0%}"
         self.bar.set_postfix_str(f"{what}{expert}{success}")
 
     def write_evaluation(self, info: dict[str, Any], **more: float) -> None:
         """What an evaluation gave."""
-        if self.totals.attempts or self._cfg.is_online:
-            more |= {"expert_steps": self.totals.expert_steps, "person_seconds": self.totals.person_seconds}
+        if self.totals["attempts"] or self._cfg.is_online:
+            more |= {name: self.totals[name] for name in ("expert_steps", "person_seconds")}
         super().write_evaluation(info, **more)
         n_episodes = info["overall"]["n_episodes"]
         logging.info(f"Evaluation after {self._state.round} rounds: {self.success:.1f} % of {n_episodes} episodes")
@@ -64,7 +63,7 @@ class Report(Progress):
         line = {"kind": kind, **place, **figures}
         self._folder.append_metrics(line)
         self._lines.append(line)
-        self.totals = Totals.of(self._lines)
+        self.totals = totals_of(self._lines)
         self._to_wandb(kind, {name: value for name, value in (place | figures).items() if not isinstance(value, list)})
 
 
@@ -93,39 +92,21 @@ def attempt_figures(by_expert: np.ndarray, fps: float, is_watched: bool) -> dict
     }
 
 
-@dataclass(frozen=True)
-class Totals:
+def totals_of(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """What attempts cost together.
 
-    Attributes:
-        attempts: How many there were.
-        expert_steps: In which the expert acted.
-        takeovers, switches: Of control.
-        person_seconds: Of a person's time.
-        autonomy: Share of the steps in which the policy acted; 1 without an attempt.
+    Args:
+        lines: Lines of `metrics.jsonl`; those that are no attempts do not matter.
+
+    Returns:
+        `attempts`, how many there were; `expert_steps`, in which the expert acted; `takeovers` and `switches` of control;
+        `person_seconds` of a person's time; `autonomy`, the share of the steps in which the policy acted, 1 without an attempt.
     """
-
-    attempts: int
-    expert_steps: int
-    takeovers: int
-    switches: int
-    person_seconds: float
-    autonomy: float
-
-    @classmethod
-    def of(cls, lines: Iterable[Mapping[str, Any]]) -> "Totals":
-        """Those of the lines of `metrics.jsonl` that are attempts; other lines do not matter."""
-        attempts = [line for line in lines if line.get("kind") == "attempt"]
-        names = ("n_frames", "n_expert_steps", "n_takeovers", "n_switches", "person_seconds")
-        steps, expert_steps, takeovers, switches, seconds = (sum(line[name] for line in attempts) for name in names)
-        return cls(
-            len(attempts),
-            expert_steps,
-            takeovers,
-            switches,
-            person_seconds=round(seconds, 2),
-            autonomy=1 - expert_steps / steps if steps else 1.0,
-        )
+    attempts = [line for line in lines if line.get("kind") == "attempt"]
+    names = ("n_frames", "n_expert_steps", "n_takeovers", "n_switches", "person_seconds")
+    steps, expert_steps, takeovers, switches, seconds = (sum(line[name] for line in attempts) for name in names)
+    totals = {"attempts": len(attempts), "expert_steps": expert_steps, "takeovers": takeovers, "switches": switches}
+    return totals | {"person_seconds": round(seconds, 2), "autonomy": 1 - expert_steps / steps if steps else 1.0}
 
 
 def round_figures(lines: Sequence[Mapping[str, Any]], number: int) -> dict[str, Any]:
@@ -135,7 +116,6 @@ def round_figures(lines: Sequence[Mapping[str, Any]], number: int) -> dict[str, 
         lines: The lines of `metrics.jsonl`.
         number: Of the round, counted from 1. Its attempts stand in lines that count the rounds before.
     """
-    totals = Totals.of(lines)
-    own = Totals.of(line for line in lines if line.get("round") == number - 1)
-    spent = {name: getattr(totals, name) for name in ("expert_steps", "takeovers", "switches", "person_seconds")}
-    return {**spent, "autonomy": round(own.autonomy, 4)}
+    totals, own = totals_of(lines), totals_of(line for line in lines if line.get("round") == number - 1)
+    spent = {name: totals[name] for name in ("expert_steps", "takeovers", "switches", "person_seconds")}
+    return {**spent, "autonomy": round(own["autonomy"], 4)}

@@ -119,17 +119,15 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     _check_dataset(cfg.policy, demos.meta, cfg.rename_map)
     method = cfg.method
     stack.callback(method.close)
-    env = expert = None
+    corrections = Corrections(cfg.interventions)
+    stack.callback(corrections.close)
+    env = None
     if cfg.is_online and cfg.env is not None:
         env = env_spec(cfg.env).make()
         stack.callback(env.close)
         expert = cfg.expert.make(env)
         stack.callback(expert.close)
         _check_expert(cfg, expert)
-        expert = method.wrap(expert)
-    corrections = Corrections(cfg.interventions)
-    stack.callback(corrections.close)
-    if env is not None and cfg.env is not None:
         facts = env_facts(env)
         features, fps, what = dataset_features(facts), facts.fps, f"--env.type={cfg.env.type}"
     else:
@@ -153,7 +151,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         )
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
     demonstrations = read_store(demos, windows, training)
-    corrections.read(windows.keys or [], demonstrations.device, demonstrations.image_size)
+    corrections.read(windows.keys, demonstrations.device, demonstrations.image_size)
     learner.warn_of_reach(demonstrations.column(ACTION), "the demonstrations")
     if corrections.store is not None:
         learner.warn_of_reach(corrections.store.column(ACTION)[frames_by_expert(corrections.store)], "the corrections")
@@ -162,10 +160,10 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     folder.begin(cfg, state)
     report = stack.enter_context(Report(cfg, training, folder, state))
     scene = None
-    if env is not None and cfg.env is not None and expert is not None:
+    if env is not None and cfg.env is not None:
         processors = (learner.preprocessor, learner.postprocessor)
         actor = PolicyActor(learner.unwrapped, cfg.env, *processors, learner.accelerator.autocast)
-        scene = Scene(env, actor, expert)
+        scene = Scene(env, actor, method.wrap(expert))
     return Loop(
         cfg, training, folder, state, learner, windows, demonstrations, corrections, batches, report, scene, method
     )
@@ -193,8 +191,8 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
         )
         totals = loop.report.totals
         print(
-            f"Expert:      {totals.expert_steps} steps in {totals.takeovers} takeovers, {totals.switches} context switches, "
-            f"autonomy {totals.autonomy:.0%}, {totals.person_seconds / 60:.1f} minutes of a person's time"
+            f"Expert:      {totals['expert_steps']} steps in {totals['takeovers']} takeovers, {totals['switches']} context "
+            f"switches, autonomy {totals['autonomy']:.0%}, {totals['person_seconds'] / 60:.1f} minutes of a person's time"
         )
     _print_what_is_learned(cfg, loop)
     if state.success is not None:

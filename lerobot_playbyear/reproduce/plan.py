@@ -223,31 +223,21 @@ class Plan:
         for study, content in self.text["studies"].items():
             if self.size not in content.get("sizes", [self.size]):
                 continue
+            shared = (self.text["seeds"], self.text["defaults"], size, content.get("values", {}))
             for task, of_task in content["tasks"].items():
                 for variant in content["variants"]:
                     named = isinstance(content["variants"], dict)
                     base = self.text["variants"].get(content["variants_of"] if named else variant, {})
                     own = content["variants"][variant] if named else {}
-                    parts = (
-                        self.text["seeds"],
-                        self.text["defaults"],
-                        size,
-                        content.get("values", {}),
-                        of_task,
-                        base,
-                        own,
-                    )
-                    values = {key: value for part in parts for key, value in part.items()}
-                    if (
-                        values["course"] in ("scripts", "learned") and not is_first
-                    ):  # scripts have no seed, players take hours
+                    values = {key: value for part in (*shared, of_task, base, own) for key, value in part.items()}
+                    # Scripts have no seed, and players take hours.
+                    if values["course"] in ("scripts", "learned") and not is_first:
                         continue
                     values |= {"task": task, "seed": seed}
                     values["steps"] *= values["steps_factor"]
                     values["rl_steps"] *= values["rl_factor"]
-                    values |= {
-                        key: min(values[key], most) for key, most in size.get("limits", {}).items() if key in values
-                    }
+                    for key in size.get("limits", {}).keys() & values.keys():
+                        values[key] = min(values[key], size["limits"][key])
                     if self.device:
                         values["training"] += f" --policy.device={self.device}"
                         values["online"] += f" --policy.device={self.device}"

@@ -53,12 +53,7 @@ def gathered(plan: Plan, table: Table) -> dict[str, Any]:
     for name, content in plan.text["studies"].items():
         own = [(cell, row) for cell, row in found if cell.study == name]
         tasks = dict.fromkeys(cell.task for cell, _ in own)
-        parts = [
-            _task(
-                [each for each in own if each[0].task == task], task, content.get("paper", {}), content.get("first", 0)
-            )
-            for task in tasks
-        ]
+        parts = [_task([each for each in own if each[0].task == task], task, content) for task in tasks]
         studies.append({"title": content["title"], "about": content["about"], "tasks": parts})
     folder = plan.output / plan.size
     return {
@@ -72,7 +67,7 @@ def gathered(plan: Plan, table: Table) -> dict[str, Any]:
     }
 
 
-def _task(found: Found, task: str, paper: dict[str, str], first: int) -> dict[str, Any]:
+def _task(found: Found, task: str, study: dict[str, Any]) -> dict[str, Any]:
     own: dict[str, list[Row | None]] = {}
     for cell, row in found:
         own.setdefault(cell.variant, []).append(row)
@@ -84,7 +79,7 @@ def _task(found: Found, task: str, paper: dict[str, str], first: int) -> dict[st
     films = [(cell.variant, path) for cell, _ in found for path in sorted((cell.folder / "films").glob("*.mp4"))]
     return {
         "name": task,
-        "lines": [_line(variant, rows, paper.get(variant, ""), first) for variant, rows in own.items()],
+        "lines": [_line(variant, rows, study) for variant, rows in own.items()],
         "bars": {variant: mean_and_error(values) for variant, values in best.items() if values},
         "curves": {name: curve for name, rows in done.items() if (curve := _curve(rows))},
         "modes": list(dict.fromkeys(mode for count in failures.values() for mode in count)),
@@ -99,19 +94,14 @@ def _task(found: Found, task: str, paper: dict[str, str], first: int) -> dict[st
     }
 
 
-def _line(variant: str, rows: Sequence[Row | None], paper: str, first: int) -> dict[str, Any]:
-    """A row of a task's table; without `success` where nothing was run. `first`: episodes that are told apart, too."""
+def _line(variant: str, rows: Sequence[Row | None], study: dict[str, Any]) -> dict[str, Any]:
+    """A row of a task's table; without `success` where nothing was run."""
     done = [row for row in rows if row is not None]
-    line = {
-        "variant": variant,
-        "paper": paper,
-        "seeds": f"{len(done)} of {len(rows)}",
-        "last": [],
-        "early": [],
-        "same": [],
-    }
+    paper = study.get("paper", {}).get(variant, "")
+    line: dict[str, Any] = {"variant": variant, "paper": paper, "seeds": f"{len(done)} of {len(rows)}"}
+    line |= {"success": "", "last": [], "early": [], "same": []}
     if not done:
-        return {**line, "success": ""}
+        return line
     if "players" in done[0]:
         players = [(name, each) for row in done for name, each in row["players"].items()]
         told = [
@@ -123,7 +113,7 @@ def _line(variant: str, rows: Sequence[Row | None], paper: str, first: int) -> d
     for what, successes in (item for row in done for item in row.get("groups", {}).items()):
         groups[what] = groups.get(what, "") + successes
     apart = [f"{what} {bits.count('1')} of {len(bits)}" for what, bits in groups.items()]
-    if first:
+    if first := study.get("first"):  # episodes that are told apart, too
         begun = [row["successes"][:first].count("1") for row in done]
         apart.append(f"first {first} episodes: {', '.join(map(str, begun))}")
     best = [value for value in map(best_rate, done) if value is not None]

@@ -184,9 +184,8 @@ def learn(cfg: ResidualConfig) -> Path:
     env.close()
     folder = cfg.output_dir / "checkpoints" / "last" / "pretrained_model"
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(
-        folder / "model.safetensors", save({k: v.contiguous() for k, v in model.actor.state_dict().items()})
-    )
+    weights = {name: value.contiguous() for name, value in model.actor.state_dict().items()}
+    write_atomically(folder / "model.safetensors", save(weights))
     return folder
 
 
@@ -217,9 +216,8 @@ def _kept(model: Any) -> bytes:
     tensors |= {f"seen.{name}": torch.from_numpy(getattr(model.replay_buffer, name)[:n]) for name in _SEEN}
     tensors["log_ent_coef"] = model.log_ent_coef.detach()
     progress = {"steps": model.num_timesteps, "pos": model.replay_buffer.pos}
-    return save(
-        {name: value.clone().contiguous() for name, value in tensors.items()}, {"progress": json.dumps(progress)}
-    )
+    copies = {name: value.clone().contiguous() for name, value in tensors.items()}
+    return save(copies, {"progress": json.dumps(progress)})
 
 
 def _restore(model: Any, path: Path) -> None:

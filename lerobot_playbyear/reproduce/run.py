@@ -199,9 +199,7 @@ def _evaluated(cell: Cell, carry: Any) -> Row:
         folder = carry(cell.evaluation(purpose, candidate))
         return told(folder / "attempts.jsonl", cell.values[f"seed_{purpose}"], cell.values[f"n_{purpose}"])
 
-    there = [
-        candidate for candidate in cell.candidates if candidate.path.exists()
-    ]  # a run may end before its last round
+    there = [each for each in cell.candidates if each.path.exists()]  # a run may end before its last round
     curve = [] if len(there) < 2 else [(each, tried("choice", each)["successes"]) for each in there]
     ranked = sorted(curve, key=lambda point: (rate(point[1]), point[0].at))
     best = [candidate for candidate, _ in ranked[-_N_BEST:]]
@@ -231,23 +229,20 @@ def _film(cell: Cell, last: Row, carry: Any) -> None:
 
 def _expert(cell: Cell) -> Row:
     """What the expert of a policy spent; empty without one."""
-    lines: list[Any] = []
-    for step in cell.steps:
-        metrics = step.folder / "metrics.jsonl"
-        if step.command[0] == "playbyear-dagger" and metrics.is_file():
-            lines += [parse_json(line) for line in metrics.read_text().splitlines()]
+    from lerobot_playbyear.dagger.report import totals_of  # imports what learns, which only running needs
+    from lerobot_playbyear.dagger.run_folder import RunFolder
+
+    lines = [line for step in cell.steps for line in RunFolder(step.folder).metrics()]
     attempts = [line for line in lines if line.get("kind") == "attempt"]
     if not attempts:
         return {}
-    from lerobot_playbyear.dagger.report import Totals  # imports what learns, which only running needs
-
-    totals = Totals.of(attempts)
+    totals = totals_of(attempts)
     return {
         "kept": sum(line.get("outcome") == "kept" for line in attempts),
-        "attempts": totals.attempts,
-        "steps": totals.expert_steps,
-        "takeovers": totals.takeovers,
-        "person_minutes": round(totals.person_seconds / 60, 1),
+        "attempts": totals["attempts"],
+        "steps": totals["expert_steps"],
+        "takeovers": totals["takeovers"],
+        "person_minutes": round(totals["person_seconds"] / 60, 1),
     }
 
 

@@ -192,9 +192,8 @@ def _call(command: list[str]) -> None:
 
 
 def _beside(step: Step, ending: str) -> Path:
-    name = (
-        step.command[-1].rpartition("/")[2].partition(".")[0] if step.name == "film" else ""
-    )  # several share a folder
+    # Films share a folder.
+    name = step.command[-1].rpartition("/")[2].partition(".")[0] if step.name == "film" else ""
     return step.folder.with_name(".".join(filter(None, [step.folder.name, name, ending])))
 
 

@@ -122,6 +122,8 @@ class PolicyWindows:
         rename_map: The dataset's names of observations, with what the policy calls them.
 
     Attributes:
+        keys: The features that a store has to hold.
+        sample_rates: At which each microphone is cut out [Hz]; of those alone whose feature says it.
         image_size: Height and width at which the policy looks at pictures [pixels].
         n_windows: Windows per item that lie in a run of frames, K.
         action_deltas: Where the actions of an item lie, in frames from its last one.
@@ -130,22 +132,13 @@ class PolicyWindows:
     def __init__(
         self, policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
     ) -> None:
-        self._meta = meta
         names = dataset_names(policy, rename_map)
         self._deltas = {names[key]: list(range(1 - n, 1)) for key, n in _history(policy).items()}
         self._deltas[ACTION] = self.action_deltas = list(policy.action_delta_indices)
+        self.keys = list(self._deltas)
+        rates = {key: sample_rate_in(meta.features[key]) for key in audio_keys(meta.features)}
+        self.sample_rates = {key: rate for key, rate in rates.items() if rate is not None}
         self.image_size, self.n_windows = policy.image_size, policy.n_supervised_steps
-
-    @property
-    def keys(self) -> list[str]:
-        """The features that a store has to hold."""
-        return list(self._deltas)
-
-    @property
-    def sample_rates(self) -> dict[str, int]:
-        """The rate at which each microphone is cut out [Hz]; of those alone whose feature says it."""
-        rates = {key: sample_rate_in(self._meta.features[key]) for key in audio_keys(self._meta.features)}
-        return {key: rate for key, rate in rates.items() if rate is not None}
 
     def batch(self, store: EpisodeStore, last_frames: Tensor) -> Batch:
         """The training items whose last frames are `last_frames` (B,), on the store's device."""

@@ -98,14 +98,10 @@ def apply_preset(args: Sequence[str]) -> list[str]:
         )
     if given.get("policy.path") is not None:
         options = {key: value for key, value in options.items() if key.removeprefix("policy.") not in _NETWORK}
-    if name == "cpu" and _computes_bfloat16():
-        options = {**options, "policy.use_amp": "true"}
+    if name == "cpu":
+        from lerobot_playbyear.policy.optimization import computes_bfloat16  # imports torch
+
+        options |= {"policy.use_amp": "true"} if computes_bfloat16() else {}
     if "policy.repo_id" in given:  # whoever names a place on the Hub wants it used
         options = {key: value for key, value in options.items() if key != "policy.push_to_hub"}
     return [*(f"--{key}={value}" for key, value in options.items() if key not in given), *args]
-
-
-def _computes_bfloat16() -> bool:
-    from lerobot_playbyear.policy.optimization import computes_bfloat16  # imports torch
-
-    return computes_bfloat16()

@@ -72,7 +72,8 @@ def cached_columns(
             found = {key: _mapped(path, n_rows) for key, path in files.items()}
             missing = {key: files[key] for key, column in found.items() if column is None}
             _check_room(folder, sum(row_bytes[key] for key in missing) * n_rows)
-            _make(missing, n_rows, pieces)
+            with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # what fails cancels what has not begun
+                list(pool.map(lambda key: _write_column(files[key], key, n_rows, pieces), missing))
             found |= {key: _mapped(path, n_rows) for key, path in missing.items()}
     return {key: column for key, column in found.items() if column is not None}
 
@@ -158,16 +159,6 @@ def _check_room(folder: Path, wanted: int) -> None:
         )
 
 
-def _make(files: Mapping[str, Path], n_rows: int, pieces: Pieces) -> None:
-    """Writes columns, several at a time."""
-    pool = ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1))
-    try:
-        for _ in pool.map(lambda key: _write_column(files[key], key, n_rows, pieces), files):
-            pass
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
 def _write_column(path: Path, key: str, n_rows: int, pieces: Pieces) -> None:
     """The rows get the column's name when all of them are on the disk, and `pieces` has ended without an error."""
     part, done = path.with_suffix(".part"), 0
@@ -178,8 +169,7 @@ def _write_column(path: Path, key: str, n_rows: int, pieces: Pieces) -> None:
                 np.lib.format.write_array_header_1_0(file, header)
             file.write(np.ascontiguousarray(piece).data)
             done += len(piece)
-        file.flush()
-        os.fsync(file.fileno())
+    flush(part)
     if done != n_rows:
         raise ValueError(f"'{key}' has {done} rows, and the dataset {n_rows}: playbyear-repair looks into it.")
     part.replace(path)

@@ -60,7 +60,10 @@ class EpisodeStore:
     Attributes:
         fps, tasks, device, image_size: As given.
         starts, ends: As given, and of episodes that were appended.
+        place: "memory" or "disk", where the tensors were read to.
     """
+
+    place = "memory"
 
     def __init__(
         self,
@@ -106,16 +109,19 @@ class EpisodeStore:
             device: Where to keep the tensors; None takes the GPU when at most half of its free memory is needed,
                 and the CPU otherwise.
             progress: Show a progress bar for the cameras.
-            place: "memory", or "disk" for files that are mapped into memory, which the next run finds again.
+            place: "memory", or "disk" for files that are mapped into memory, which the next run finds again. "auto" is memory
+                where the frames fill at most half of what is free.
             image_size: Keep pictures no larger than this, shrunk as the policy `playbyear` does [pixels].
             cache: Folder of the files; None takes one beside LeRobot's cache.
             sample_rates: Keep these microphones at these rates, resampled where they were recorded at others [Hz].
 
         Raises:
-            ValueError: If a key is missing or cannot be kept, sound breaks the contract, a value is NaN or infinite,
-                there are no frames, or the disk has no room.
+            ValueError: If there is no such place, a key is missing or cannot be kept, sound breaks the contract, a value is
+                NaN or infinite, there are no frames, or the disk has no room.
             MemoryError: If the tensors do not fit into the memory.
         """
+        if place not in PLACES:
+            raise ValueError(f"--store={place} is not known: wanted one of {', '.join(PLACES)}.")
         reader = dataset if isinstance(dataset, DatasetReader) else DatasetReader.of(dataset)
         if len(reader) == 0:
             raise ValueError(f"The dataset '{reader.repo_id}' is empty: it has no frames. Record at least one episode.")
@@ -126,6 +132,8 @@ class EpisodeStore:
         new_rates = {key: kept[key]["info"]["sample_rate"] for key in features if kept[key] is not features[key]}
         row_bytes = {key: _row_bytes(feature, image_size) for key, feature in kept.items()}
         n_bytes = sum(row_bytes.values()) * len(reader)
+        if place == "auto":
+            place = "memory" if n_bytes <= _MEMORY_SHARE * available_memory() else "disk"
         device = _choose_device(device, n_bytes)
         n_cameras = sum(feature["dtype"] in _CAMERA_DTYPES for feature in features.values())
         total, is_hidden = n_cameras * len(reader), not (progress and n_cameras)
@@ -144,7 +152,9 @@ class EpisodeStore:
         episode_index, frame_index, task_index = (columns.pop(key).cpu() for key in _NUMBERING)
         starts, ends = _episodes(episode_index, frame_index, columns.get(IS_FIRST), reader)
         tasks = list(reader.meta.tasks.index)
-        return cls(columns, starts, ends, reader.fps, tasks, device, image_size, task_index)
+        store = cls(columns, starts, ends, reader.fps, tasks, device, image_size, task_index)
+        store.place = place
+        return store
 
     def __len__(self) -> int:
         """The number of frames, N."""
@@ -277,23 +287,6 @@ def _with_rows(values: Tensor, position: int, new: Tensor) -> Tensor:
 # What a dataset holds
 
 
-def choose_place(
-    place: str, reader: DatasetReader, keys: Iterable[str] | None = None, sample_rates: Mapping[str, int] | None = None
-) -> str:
-    """Where to keep a dataset: "memory" or "disk". "auto" is memory where its frames fill at most half of what is free.
-
-    Raises:
-        ValueError: There is no such place.
-    """
-    if place not in PLACES:
-        raise ValueError(f"--store={place} is not known: wanted one of {', '.join(PLACES)}.")
-    if place != "auto":
-        return place
-    kept = features_at(_select_features(reader, keys), sample_rates or {}, reader.fps)
-    n_bytes = sum(map(_row_bytes, kept.values())) * len(reader)
-    return "memory" if n_bytes <= _MEMORY_SHARE * available_memory() else "disk"
-
-
 def features_at(features: Mapping[str, Any], sample_rates: Mapping[str, int], fps: float) -> dict[str, Any]:
     """A dataset's features, its microphones at other sample rates.
 
@@ -388,7 +381,7 @@ def _select_features(reader: DatasetReader, keys: Iterable[str] | None) -> dict[
     return {key: features[key] for key in keys}
 
 
-def _row_bytes(feature: Mapping[str, Any], image_size: int | None = None) -> int:
+def _row_bytes(feature: Mapping[str, Any], image_size: int | None) -> int:
     """Of a camera kept at `image_size`, at most."""
     dtype, shape = feature["dtype"], tuple(feature["shape"])
     if dtype in _CAMERA_DTYPES:

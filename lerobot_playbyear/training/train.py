@@ -22,17 +22,11 @@ from lerobot_playbyear.datasets.files import check_can_be_made, check_no_links, 
 from lerobot_playbyear.datasets.reader import DatasetReader, check_dataset_files
 from lerobot_playbyear.hub.push import METRICS_NAME, RUN_FOLDERS, PushOptions, check_upload, push_policy
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.training.batches import (
-    Batch,
-    PolicyWindows,
-    learned_meta,
-    make_batches,
-    runs_of_each_frame,
-)
+from lerobot_playbyear.training.batches import Batch, PolicyWindows, learned_meta, make_batches, runs_of_each_frame
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.learner import Learner, make_accelerator, make_learner, noise_seed
 from lerobot_playbyear.training.report import Report, is_due, print_results
-from lerobot_playbyear.training.store import EpisodeStore, choose_place
+from lerobot_playbyear.training.store import EpisodeStore
 
 Loss = Callable[[], float]
 
@@ -128,8 +122,7 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
     _check_place(cfg)
     _check_links(Path(str(cfg.output_dir)))
     check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
-    if cfg.policy is None:
-        raise ValueError("No policy: give --preset=cpu or gpu, --policy.path, or --policy.type=playbyear.")
+    assert cfg.policy is not None  # or LeRobot would have refused it
     if not isinstance(cfg.policy, PlaybyearConfig):
         raise ValueError(
             f"--policy.type={cfg.policy.type}: playbyear-train trains policies of --policy.type=playbyear alone; give that, "
@@ -195,23 +188,20 @@ def read_store(
     Raises:
         ValueError, MemoryError: As `EpisodeStore.from_dataset`.
     """
-    start = time.perf_counter()
-    options = cfg.store
-    wanted = "disk" if is_shared and options.place == "auto" else options.place
-    place = choose_place(wanted, reader, windows.keys, windows.sample_rates)
+    start, options = time.perf_counter(), cfg.store
     store = EpisodeStore.from_dataset(
         reader,
         windows.keys,
         options.device,
         progress=not inside_slurm(),
-        place=place,
+        place="disk" if is_shared and options.place == "auto" else options.place,
         image_size=windows.image_size,
         cache=None if options.cache is None else Path(options.cache),
         sample_rates=windows.sample_rates,
     )
-    where = f"on the disk, {store.device}" if place == "disk" else f"in memory, {store.device}"
+    where = "on the disk" if store.place == "disk" else "in memory"
     logging.info(
-        f"{len(store)} frames of {store.n_episodes} episodes {where} ({store.nbytes / 2**20:.0f} MiB) after "
+        f"{len(store)} frames of {store.n_episodes} episodes {where}, {store.device} ({store.nbytes / 2**20:.0f} MiB) after "
         f"{time.perf_counter() - start:.1f} s"
     )
     return store
