@@ -212,9 +212,7 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
         print(f"No update was made: {_why_none(cfg, state)}.\n{go_on}")
         return
     policy = folder.checkpoints / "last" / PRETRAINED_MODEL_DIR
-    env = " --env.type=..."
-    if cfg.env is not None:
-        env = f" --env.type={cfg.env.type} --env.task={shlex.quote(str(cfg.env.task))}"
+    env = f" --env.type={cfg.env.type} --env.task={shlex.quote(str(cfg.env.task))}" if cfg.env else " --env.type=..."
     print(f"Policy:      {policy}")
     print(f"Evaluate:    lerobot-eval --policy.path={policy}{printable(env)}")
     print(go_on)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 from torchvision.models import ResNet
 
+from lerobot_playbyear import compat
 from lerobot_playbyear.compat import BasicBlock, n_changes
 from lerobot_playbyear.policy.networks import VisionEncoder
 from lerobot_playbyear.policy.optimization import HAS_512_BITS
@@ -120,14 +121,9 @@ class PackedResNet:
     """
 
     def __init__(self, folded: ResNet) -> None:
-        from lerobot_playbyear.compat import (  # not in every build of torch
-            convolution_pointwise,
-            convolution_pointwise_binary,
-            reorder_convolution_weight,
-        )
-
-        self._pack, self._convolution = reorder_convolution_weight, convolution_pointwise
-        self._convolution_and_sum = convolution_pointwise_binary
+        # Looked up now: they are not in every build of torch.
+        self._pack, self._convolution = compat.reorder_convolution_weight, compat.convolution_pointwise
+        self._convolution_and_sum = compat.convolution_pointwise_binary
         self._network = folded
         self._weights: dict[nn.Module, Tensor] = {}
 

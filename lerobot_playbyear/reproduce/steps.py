@@ -177,18 +177,16 @@ def _become(command: list[str], log: Path, threads: int) -> int:
 
 
 def _call(command: list[str]) -> None:
-    name, *rest = command
-    if name == "python":
-        module, path = (rest[1], None) if rest[0] == "-m" else (None, rest[0])
-        sys.argv = rest[1:] if module else rest
-        if module:
-            runpy.run_module(module, run_name="__main__", alter_sys=True)
-        else:
-            sys.path.insert(0, os.path.dirname(os.path.abspath(str(path))))  # as Python does for a program
-            runpy.run_path(str(path), run_name="__main__")
-        return
-    sys.argv = command
-    next(iter(metadata.entry_points(group="console_scripts", name=name))).load()()
+    if command[:2] == ["python", "-m"]:
+        sys.argv = command[2:]
+        runpy.run_module(command[2], run_name="__main__", alter_sys=True)
+    elif command[0] == "python":
+        sys.argv = command[1:]
+        sys.path.insert(0, os.path.dirname(os.path.abspath(command[1])))  # as Python does for a program
+        runpy.run_path(command[1], run_name="__main__")
+    else:
+        sys.argv = command
+        next(iter(metadata.entry_points(group="console_scripts", name=command[0]))).load()()
 
 
 def _beside(step: Step, ending: str) -> Path:

@@ -27,13 +27,7 @@ from lerobot.utils.random_utils import load_rng_state
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
-from lerobot_playbyear.compat import (
-    eval_policy_all,
-    get_step_checkpoint_dir,
-    get_step_identifier,
-    save_checkpoint,
-    update_last_checkpoint,
-)
+from lerobot_playbyear import compat
 from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.features import is_depth, number_names
 from lerobot_playbyear.datasets.files import INFO_PATH, parse_json
@@ -44,7 +38,6 @@ from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import VisionEncoder
 from lerobot_playbyear.policy.processor_playbyear import microphone_step
-from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.batches import dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
@@ -129,16 +122,16 @@ class Learner:
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
         """Write a checkpoint where lerobot-train would, and return its folder."""
-        folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
+        folder = compat.get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
         self.write_checkpoint(folder, cfg)
-        update_last_checkpoint(folder)
+        compat.update_last_checkpoint(folder)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
             push_checkpoint(folder, cfg.policy.repo_id, cfg.policy.private)
         return folder
 
     def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:
         """Write LeRobot's checkpoint into a folder."""
-        save_checkpoint(
+        compat.save_checkpoint(
             self.accelerator,
             cfg,
             checkpoint_dir=folder,
@@ -159,10 +152,10 @@ class Learner:
         assert cfg.env is not None
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg=cfg.env, policy_cfg=cfg.policy)
         envs = make_env(cfg.env, n_envs=cfg.eval.batch_size, use_async_envs=cfg.eval.use_async_envs)
-        videos = Path(str(cfg.output_dir)) / "eval" / f"videos_step_{get_step_identifier(self.step, cfg.steps)}"
+        videos = Path(str(cfg.output_dir)) / "eval" / f"videos_step_{compat.get_step_identifier(self.step, cfg.steps)}"
         try:
             with torch.no_grad(), self.accelerator.autocast():
-                info = eval_policy_all(
+                info = compat.eval_policy_all(
                     envs=envs,
                     policy=self.unwrapped,
                     env_preprocessor=env_preprocessor,
@@ -178,9 +171,8 @@ class Learner:
         finally:
             close_envs(envs)
             self.policy.train()
-        of_each = [
-            getattr(env, "acted_early", ())[: cfg.eval.n_episodes] for group in envs.values() for env in group.values()
-        ]
+        each_env = [env for group in envs.values() for env in group.values()]
+        of_each = [getattr(env, "acted_early", ())[: cfg.eval.n_episodes] for env in each_env]
         told = [early for episodes in of_each for early in episodes if early is not None]
         if told:
             info["overall"]["pc_acted_early"] = 100.0 * sum(told) / len(told)
@@ -265,6 +257,8 @@ def make_learner(
     assert isinstance(policy, PlaybyearPolicy)
     if keep_normalization:
         policy.keep_normalization()
+    if cfg.policy.use_audio:
+        policy.model.disturb.read_recordings()
     accelerator = accelerator or make_accelerator(cfg.policy)
     stats = None if cfg.resume or keep_normalization else meta.stats
     preprocessor, postprocessor = _make_processors(cfg, policy, stats, accelerator.device)
@@ -279,9 +273,6 @@ def make_learner(
         compile_networks(policy)
     policy, optimizer, scheduler = accelerator.prepare(policy, optimizer, scheduler)
     policy.train()
-    for module in policy.modules():
-        if isinstance(module, SoundAugmentation):
-            module.read_recordings()
     names = number_names(meta.features[ACTION])
     return Learner(accelerator, policy, optimizer, scheduler, preprocessor, postprocessor, names, step)
 

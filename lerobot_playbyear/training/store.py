@@ -138,8 +138,7 @@ class EpisodeStore:
         n_cameras = sum(feature["dtype"] in _CAMERA_DTYPES for feature in features.values())
         total, is_hidden = n_cameras * len(reader), not (progress and n_cameras)
         # Delayed, for what is there already takes less.
-        bar = tqdm(desc="Reading frames", total=total, unit="frame", delay=1, disable=is_hidden)
-        with bar:
+        with tqdm(desc="Reading frames", total=total, unit="frame", delay=1, disable=is_hidden) as bar:
             pieces = partial(_pieces, reader, image_size, new_rates, bar)
             if place == "disk":
                 identity = {**dataset_identity(reader, features), "image_size": image_size, "sample_rates": new_rates}

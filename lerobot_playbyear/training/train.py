@@ -85,7 +85,10 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     if accelerator.is_main_process:
         print_results(cfg, report.success, report.acted_early)
         if cfg.policy.push_to_hub:
-            _push(cfg, learner)
+            # The last checkpoint is on disk, and stays there.
+            folder = (Path(str(cfg.output_dir)) / "checkpoints" / "last") if cfg.save_checkpoint else learner.save(cfg)
+            options = PushOptions(cfg.policy.private)
+            print(f"On the Hub: {push_policy(folder / 'pretrained_model', str(cfg.policy.repo_id), options)}")
     accelerator.wait_for_everyone()  # gloo may hang if a group ends while a sum of tensors has just been made
     accelerator.end_training()
     return Path(str(cfg.output_dir))
@@ -205,12 +208,3 @@ def read_store(
         f"{time.perf_counter() - start:.1f} s"
     )
     return store
-
-
-def _push(cfg: PlaybyearTrainConfig, learner: Learner) -> None:
-    """Uploads the last checkpoint, which is on disk and stays there."""
-    assert cfg.policy is not None
-    assert cfg.policy.repo_id is not None
-    folder = (Path(str(cfg.output_dir)) / "checkpoints" / "last") if cfg.save_checkpoint else learner.save(cfg)
-    url = push_policy(folder / "pretrained_model", cfg.policy.repo_id, PushOptions(cfg.policy.private))
-    print(f"On the Hub: {url}")
