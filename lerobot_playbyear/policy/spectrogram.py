@@ -114,7 +114,6 @@ class LogSpectrogram(nn.Module):
 
     def __init__(self, sample_rate: int, segment_s: float, hop_s: float, n_bins: int, momentum: float = 0.01):
         super().__init__()
-        self.sample_rate = sample_rate
         self.segment, self.hop = segment_and_hop(sample_rate, segment_s, hop_s)
         if n_bins > self.segment // 2 + 1:
             raise ValueError(
