@@ -37,7 +37,7 @@ def windows(n_windows):
         device="cpu",
         push_to_hub=False,
     )
-    return PolicyWindows(config, SimpleNamespace(fps=20))
+    return PolicyWindows(config, SimpleNamespace(fps=20, features={}))
 
 
 def supervised(batch):

@@ -145,8 +145,7 @@ def test_acting_stays_on_the_card_and_the_host_waits_once_per_microphone():
             for _ in range(3):
                 frame = {key: torch.rand(1, *feature.shape, device="cuda") for key, feature in features}
                 encoding = policy.model.encode(recent.add(frame, policy.model.prepare_images), 1)
-                encodings = encoding.unsqueeze(1).repeat(1, policy.config.memory_steps, 1)
-                actions = policy.act_from(policy.model.memory_head.recall(encodings))
+                actions = policy.model.memory_head(encoding.unsqueeze(1).repeat(1, policy.config.memory_steps, 1))
         assert actions.device.type == "cuda"
         assert len(waits.lines) == 3
         assert all("peak" in line for line in waits.lines)

@@ -48,7 +48,10 @@ class FoldedVisionEncoder(VisionEncoder):
     """
 
     def __init__(self, plain: VisionEncoder) -> None:
-        vars(self).update(vars(plain))
+        nn.Module.__init__(self)
+        self.embedding_size, self.network = plain.embedding_size, plain.network
+        self.register_buffer("mean", plain.mean, persistent=False)
+        self.register_buffer("std", plain.std, persistent=False)
         self._folded = FoldedCopy()  # no part of a checkpoint
 
     def forward(self, stacks: Tensor) -> Tensor:

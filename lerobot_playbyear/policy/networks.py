@@ -312,12 +312,16 @@ class MemoryHead(nn.Module):
         """What is kept of frames: their joint encodings (N, embedding size), and with displacements what was felt, (N, D)."""
         return torch.cat([fused, *felt], dim=-1) if self.displacement_gain else fused
 
-    def recall(self, encodings: Tensor) -> Tensor:
-        """The memory's output after every full window of consecutive frames, (B, n, D).
+    def forward(self, encodings: Tensor) -> Tensor:
+        """The action after every full window of consecutive frames, (B, n, D).
 
         Returns:
-            (B, K, embedding size) with K = n - H + 1.
+            (B, K, n_actions) with K = n - H + 1, in [-1, 1] times the action range.
         """
+        return self.act(self.recall(encodings))
+
+    def recall(self, encodings: Tensor) -> Tensor:
+        """(B, n, D) consecutive frames -> (B, K, embedding size), the memory's output after every full window."""
         windows = encodings.unfold(1, self.memory_steps, 1).transpose(2, 3)  # (B, K, H, D)
         if self.displacement_gain:
             felt = windows[..., self.n_fused :]
@@ -337,7 +341,7 @@ class MemoryHead(nn.Module):
         return self.lstm(windows)[0]
 
     def act(self, memories: Tensor) -> Tensor:
-        """(..., embedding size) of `recall` -> (..., n_actions), in [-1, 1] times the action range."""
+        """(..., embedding size) of `recall` -> (..., n_actions)."""
         actions = self.head(memories.flatten(0, -2)).float()  # whatever autocast computed in
         actions = self.action_range * torch.tanh(actions / self.action_range)
         return actions.unflatten(0, memories.shape[:-1])
