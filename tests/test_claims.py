@@ -152,14 +152,15 @@ def listening() -> list[str]:
 
 
 def interventions() -> list[str]:
-    (alone, *_), (full,), (redo,), (twice,) = (
+    (alone, *others), (full, second), (redo, *_), (twice, *_) = (
         rows("interventions", GRASP, variant) for variant in ("no_interventions", "full", "redo", "equal_updates")
     )
-    assert (full["expert"]["kept"], redo["expert"]["kept"]) == (100, 50)
+    assert (full["expert"]["kept"], redo["expert"]["kept"], second["seed"]) == (100, 50, others[0]["seed"])
     return [
         f"{share([alone])} become {share([full])} by HG-DAgger as published: 100 corrected episodes, "
         f"{full['expert']['person_minutes']:.0f} operator minutes. 50 failed scenes make them {share([redo])}, "
-        f"in {redo['expert']['person_minutes']:.0f} minutes; twice the updates alone {share([twice])}."
+        f"in {redo['expert']['person_minutes']:.0f} minutes; twice the updates alone {share([twice])}. A second "
+        f"training: {share([others[0]])[:-2]}, then {share([second])}."
     ]
 
 

@@ -132,6 +132,7 @@ def walked(robot, tmp_path_factory) -> Iterator[list[tuple[list[str], Done]]]:
     """The tutorial, and what its commands said; the current folder is its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("tutorial"))
+        Path("examples").symlink_to(ROOT / "examples")
         yield [(words, robot.run(words)) for words in commands("tutorials/so101.md", SMALL)]
 
 
