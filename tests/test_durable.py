@@ -425,8 +425,11 @@ def test_a_second_writer_waits_until_the_first_has_closed(tmp_path, monkeypatch,
     with pytest.raises(FolderLockedError, match="Another process is writing"):
         writer(tmp_path)
     first.close()
-    first.close()
-    writer(tmp_path).close()
+    with writer(tmp_path):
+        staged = tmp_path / STAGING / "of_the_second"
+        staged.mkdir(parents=True)
+        first.close()  # once more: the dataset is another's now
+        assert staged.is_dir()
 
 
 def arm(*joints: str) -> dict[str, Any]:

@@ -160,7 +160,7 @@ def test_a_sound_dataset_is_left_alone(copy):
 def test_a_recording_that_lerobot_could_not_finish_is_whole_again(copy, originals):
     """And goes on, in the copy; what was killed is not continued."""
     root = copy("killed")
-    with pytest.raises(InputError, match=r"(?s)no meta/episodes.*playbyear-repair --root="):
+    with pytest.raises(DatasetDamagedError, match=r"(?s)no meta/episodes.*playbyear-repair --root="):
         write(root, [N_EPISODES], RICH_FEATURES)
     report = repaired(root, RICH_FEATURES)
     assert "no valid end" in str(report)

@@ -407,13 +407,19 @@ def _own_files(track: AudioTrack, dataset: DatasetReader, scratch: Path) -> Sour
         needed_s[span.path] = max(end_s, needed_s.get(span.path, 0.0))
 
     @cache
-    def decoded(path: Path) -> tuple[np.ndarray, int]:
+    def decoded(path: Path) -> tuple[np.ndarray, int] | AudioFileError:
         place = scratch / f"{track.key}-file-{list(needed_s).index(path)}"
-        return _decoded(_checked_pieces(track, path, needed_s[path]), place)
+        try:
+            return _decoded(_checked_pieces(track, path, needed_s[path]), place)
+        except AudioFileError as error:  # which is not to be tried again for each episode
+            return error
 
     def recording(episode: int) -> Recording:
         span = track.spans[episode]
-        samples, rate = decoded(span.path)
+        found = decoded(span.path)
+        if isinstance(found, AudioFileError):
+            raise found
+        samples, rate = found
         stop = len(samples) if span.end_s is None else round(span.end_s * rate)
         return samples[round(span.start_s * rate) : stop], rate, track.start_time_s, 1.0
 

@@ -8,6 +8,7 @@ schema, statistics and video, and then moves them into place, so that the datase
 
 import contextlib
 import logging
+import os
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -28,7 +29,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot_playbyear.datasets.episode_files import stage_episode
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
 from lerobot_playbyear.datasets.features import Features, check_features, check_frame, differences, is_depth
-from lerobot_playbyear.datasets.files import INFO_PATH, list_files
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, list_files
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.info import check_parts, nothing_in
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, finish_journal, lock_dataset, publish, remove_staged
@@ -45,7 +46,7 @@ _SAVING = 2  # saving takes this many times the memory of the episode in additio
 _SPARE_BYTES = 256 * 2**20
 
 
-class DurableWriter(contextlib.AbstractContextManager["DurableWriter"]):
+class DurableWriter:
     """Appends episodes to a LeRobotDataset v3.0; each is on disk for good when `save_episode` returns.
 
     Protocol: the files that the dataset will have with the episode are written into its scratch folder; a journal is
@@ -76,7 +77,6 @@ class DurableWriter(contextlib.AbstractContextManager["DurableWriter"]):
         DatasetWriteError: `root` cannot be read or written.
         FolderLockedError: Another process is writing to it.
         DatasetDamagedError: The dataset in `root` is damaged; the message says how, and what to do.
-        InputError: A whole part of it is missing; likewise.
         JournalError: What the dataset's scratch folder says is to be moved lies outside the dataset.
     """
 
@@ -96,29 +96,30 @@ class DurableWriter(contextlib.AbstractContextManager["DurableWriter"]):
         self.root = Path(root)
         self.features = features
         self._encoder = rgb_encoder or rgb_encoder_defaults()
+        self._lock: FolderLock | None = None
         self._pool = ThreadPoolExecutor(_THREADS)
         self._forget_episode()
         try:
             check_root(self.root, resume=resume)
-            with contextlib.ExitStack() as stack:
-                stack.push(lock_dataset(self.root))
-                finish_journal(self.root)
-                if has_dataset(self.root):
-                    check_undamaged(self.root)
-                    self._info = load_info(self.root)
-                    _check_compatible(self.root, self._info, fps, features, robot_type)
-                else:
-                    self._info = _new_info(fps, features, robot_type)
-                if remove_staged(self.root):
-                    logger.warning(
-                        f"{self.root}: an episode that had not been saved was removed; the {self.num_episodes} episodes "
-                        "before it are complete."
-                    )
-                self._lock = stack.pop_all()
-        except FileExistsError:
+            self._lock = lock_dataset(self.root)
+            finish_journal(self.root)
+            if has_dataset(self.root):
+                check_undamaged(self.root)
+                self._info = load_info(self.root)
+                _check_compatible(self.root, self._info, fps, features, robot_type)
+            else:
+                self._info = _new_info(fps, features, robot_type)
+            if remove_staged(self.root):
+                logger.warning(
+                    f"{self.root}: an episode that had not been saved was removed; the {self.num_episodes} episodes "
+                    "before it are complete."
+                )
+        except BaseException as error:
+            if self._lock is not None:
+                self._lock.close()
+            if isinstance(error, OSError) and not isinstance(error, FileExistsError):
+                raise DatasetWriteError(f"Cannot write to {self.root}: {error.strerror or error}.") from error
             raise
-        except OSError as error:
-            raise DatasetWriteError(f"Cannot write to {self.root}: {error.strerror or error}.") from error
 
     @property
     def num_episodes(self) -> int:
@@ -187,6 +188,8 @@ class DurableWriter(contextlib.AbstractContextManager["DurableWriter"]):
 
     def close(self) -> None:
         """Drops an episode in progress. Safe to call twice."""
+        if self._lock is None:
+            return
         if self._is_complete:
             with contextlib.suppress(OSError):  # the next writer tries again
                 finish_journal(self.root)
@@ -194,6 +197,10 @@ class DurableWriter(contextlib.AbstractContextManager["DurableWriter"]):
         self._forget_episode()
         self._pool.shutdown(cancel_futures=True)
         self._lock.close()
+        self._lock = None
+
+    def __enter__(self) -> "DurableWriter":
+        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -300,9 +307,10 @@ def has_dataset(root: Path) -> bool:
         OSError: It, or a folder in it, cannot be listed: that says nothing of what it holds.
     """
     try:
-        return any(list_files(root, name) for name in (INFO_PATH, "data/chunk-*/file-*", "meta/episodes/*/*"))
+        os.listdir(root)
     except FileNotFoundError:
         return False
+    return any(list_files(root, name) for name in (INFO_PATH, "data/chunk-*/file-*", "meta/episodes/*/*"))
 
 
 def check_undamaged(root: Path) -> None:
@@ -310,7 +318,6 @@ def check_undamaged(root: Path) -> None:
 
     Raises:
         DatasetDamagedError: It is damaged; with what is wrong, and the command that repairs it.
-        InputError: A whole part of it is missing.
         DatasetWriteError: It cannot be read.
     """
     try:
@@ -318,7 +325,10 @@ def check_undamaged(root: Path) -> None:
     except OSError as error:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
     if not found.is_undamaged:
-        check_parts(root)
+        try:
+            check_parts(root)
+        except InputError as error:
+            raise DatasetDamagedError(str(error)) from error
         command = repair_command(root)
         raise DatasetDamagedError(
             f"{found}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "
