@@ -229,13 +229,13 @@ def _film(cell: Cell, last: Row, carry: Any) -> None:
 
 def _expert(cell: Cell) -> Row:
     """What the expert of a policy spent; empty without one."""
-    from lerobot_playbyear.dagger.report import totals_of  # imports what learns, which only running needs
+    taught = [step.folder for step in cell.steps if step.command[0] == "playbyear-dagger"]
+    if not taught:
+        return {}
+    from lerobot_playbyear.dagger.report import totals_of  # imports LeRobot, which such a cell has imported already
     from lerobot_playbyear.dagger.run_folder import RunFolder
 
-    lines = [line for step in cell.steps for line in RunFolder(step.folder).metrics()]
-    attempts = [line for line in lines if line.get("kind") == "attempt"]
-    if not attempts:
-        return {}
+    attempts = [line for folder in taught for line in RunFolder(folder).metrics() if line.get("kind") == "attempt"]
     totals = totals_of(attempts)
     return {
         "kept": sum(line.get("outcome") == "kept" for line in attempts),

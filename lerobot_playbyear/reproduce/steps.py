@@ -138,6 +138,7 @@ def forked(work: Callable[[], int]) -> int:
     Returns:
         The copy's number.
     """
+    parent = os.getpid()
     sys.stdout.flush()
     sys.stderr.flush()
     with warnings.catch_warnings():
@@ -148,6 +149,8 @@ def forked(work: Callable[[], int]) -> int:
         try:
             if sys.platform == "linux":
                 ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+                if os.getppid() != parent:  # it ended before it could be asked for
+                    os._exit(status)
             status = work()
         except BaseException:
             traceback.print_exc()
