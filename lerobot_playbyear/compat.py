@@ -110,7 +110,7 @@ def metrics_tracker(accelerator: "Accelerator | None", *figures: Any, initial_st
     from lerobot.utils.logging_utils import MetricsTracker
 
     processes: dict[str, Any] = {"accelerator": accelerator}
-    if "accelerator" not in signature(MetricsTracker).parameters:  # as in LeRobot 0.6.1
+    if "accelerator" not in signature(MetricsTracker).parameters:  # it has them in LeRobot 0.6.1
         processes = {"dp_world_size": 1 if accelerator is None else accelerator.num_processes}
     return MetricsTracker(*figures, initial_step=initial_step, **processes)
 

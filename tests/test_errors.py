@@ -5,6 +5,7 @@ its message says, between bars. What stands in braces is made when the first row
 in `{out}`. The second table is of what is refused to whoever calls the package: a function below, its arguments, and the same.
 """
 
+import json
 import re
 import shlex
 from collections.abc import Callable
@@ -30,6 +31,7 @@ BASE = {
     "record": f"playbyear-record {' '.join(ENV)} --dataset.repo_id=t/new --dataset.root={{out}}/new --num_workers=0",
     "train": f"playbyear-train {' '.join(TINY)} --dataset.repo_id=t/noise --dataset.root={{noise}} --steps=1 "
     "--output_dir={out}/train",
+    "train nothing": "playbyear-train --dataset.repo_id=t/noise --dataset.root={noise} --output_dir={out}/train",
     "train act": "playbyear-train --policy.type=act --policy.push_to_hub=false --dataset.repo_id=t/noise "
     "--dataset.root={noise} --output_dir={out}/train",
     "dagger": f"playbyear-dagger {' '.join(ENV)} --policy.path={{policy}} --dataset.repo_id=tests/demos "
@@ -75,6 +77,8 @@ record | --dataset.root={truncated} --resume=true | {truncated} | damaged | play
 record | --dataset.root={noise} --resume=true | {noise} does not fit | seed is absent there | choose another root
 train | --output_dir={full} | {full} already exists | resume
 train | --output_dir={file}/run | --output_dir={file}/run cannot be written: Not a directory | wanted
+train | --dataset.root={dangling} | There is no LeRobotDataset in '{dangling}': it has no meta/info.json | Correct
+train | --dataset.root={nowhere} | {nowhere}/meta/info.json is damaged: data_path is None | --like=
 train | --dataset.root={truncated} | file-000.parquet is truncated | playbyear-repair --root={truncated}
 dagger | --output_dir={full} | {full} holds files, but no run of playbyear-dagger
 dagger | --interventions.root={demos} | --dataset and --interventions are the same dataset | of their own
@@ -125,6 +129,7 @@ record | --expert.type=teleop --expert.takeover_key=e | takeover_key='e': it mea
 record | --expert.type=teleop --expert.takeover=press | takeover='press' | give hold or toggle
 record | --expert.type=teleop | No window can be opened (DISPLAY='')
 # Training
+train nothing | --reward_model.path={reward} | No policy: give --preset=cpu
 train act | --steps=1 | --policy.type=act | --policy.type=playbyear | lerobot-train
 train | --preset=paper --policy.type=act | --preset=paper is for --policy.type=playbyear, not for act
 train | --store=tape | --store=tape is not known: wanted one of memory, disk, auto
@@ -173,6 +178,7 @@ attach-audio | --session={sounds}/day.wav | both are given. Give one
 session | -session | is for --files and one --session
 session | --session={out}/no.wav | There is no sound file | {out}/no.wav
 session | -clock | playbyear_clock.json. Give --clock=times.csv
+session | --clock={out}/tiems.csv | there is no {out}/tiems.csv. Give --clock=times.csv
 session | --marks=1.0 | '1.0' is not a mark; wanted seconds in the sound file = seconds on the clock
 session | --marks=1=5,2=5 | the same time on the clock
 session | --marks=10=1,20=5 | 2.5000 seconds of sound in a second of the clock
@@ -278,6 +284,23 @@ def truncated(root: Path) -> None:
     path.write_bytes(path.read_bytes()[:-50])
 
 
+def dangling(root: Path) -> None:
+    make_dataset(root, (5,), image_size=16)
+    (root / "meta/info.json").unlink()
+    (root / "meta/info.json").symlink_to(root / "gone.json")
+
+
+def nowhere(root: Path) -> None:
+    make_dataset(root, (5,), image_size=16)
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps({key: value for key, value in info.items() if key != "data_path"}))
+
+
+def reward(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "config.json").write_text('{"type": "reward_classifier", "push_to_hub": false}')
+
+
 def sounds(folder: Path) -> None:
     """Of `silent`: a file for each episode, at two rates, and one of the session with times of its episodes."""
     for rate, place in ((16000, folder), (11025, folder / "odd")):
@@ -299,6 +322,9 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "act": lambda folder: (folder.mkdir(), ACTConfig(device="cpu", push_to_hub=False).save_pretrained(folder)),
     "empty": lambda root: LeRobotDataset.create("t/empty", 20, without(), root=root, use_videos=False).finalize(),
     "truncated": truncated,
+    "dangling": dangling,
+    "nowhere": nowhere,
+    "reward": reward,
     "sounds": sounds,
 }
 

@@ -210,9 +210,9 @@ def test_columns_are_the_same_from_videos_and_from_pictures_and_gaps_are_noted(t
     is_first = np.zeros(55, bool)
     is_first[[0, 20, 40]] = True
     np.testing.assert_array_equal(column(images, "is_first").reshape(-1), is_first)
-    steps, expected = ControlStepSound(SIZE), []
+    expected = []
     for counters in episodes:
-        steps.reset()
+        steps = ControlStepSound(SIZE)
         expected += [steps.next(session.strip(counter))[0] for counter in counters]
     np.testing.assert_array_equal(column(images), expected)
     assert images.meta.features[KEY]["info"] == {"sample_rate": RATE, "encoding": "pcm_s16"}

@@ -64,12 +64,11 @@ def test_killed_at_ten_moments_every_episode_that_repair_keeps_gets_its_sound(vi
         heard = LeRobotDataset("me/killed_with_sound", root=target, video_backend="pyav", return_uint8=True)
         assert heard.num_episodes == repaired.num_episodes
         n_kept += heard.num_episodes
-        steps = ControlStepSound(RATE // FPS)
         for i in range(len(heard)):
             frame = heard[i]
             session, counter = read_timecode(frame[KEY].permute(1, 2, 0).numpy()) or (0, 0)
             if frame["frame_index"] == 0:
-                steps.reset()
+                steps = ControlStepSound(RATE // FPS)
             kept = samples[np.arange(counter - RATE // 4, counter) % len(samples)]
             block, _ = steps.next(Strip(session, counter, RATE, kept))
             np.testing.assert_array_equal(frame["observation.audio.mic"].numpy(), block)

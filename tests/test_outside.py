@@ -536,6 +536,15 @@ def test_a_small_table_of_many_tasks_takes_no_memory_that_is_not_there(noise, tm
             read("a/b", root)
 
 
+def test_memory_that_runs_out_while_the_tasks_are_read_is_no_damage(noise, monkeypatch):
+    def fail(_: Path) -> None:
+        raise pa.ArrowMemoryError("malloc of size 4194304 failed")
+
+    monkeypatch.setattr("lerobot_playbyear.datasets.survey.read_table", fail)
+    with pytest.raises(MemoryError, match="malloc"):
+        survey(noise)
+
+
 @pytest.mark.parametrize("part", ["meta/episodes", "data"])
 def test_long_lists_of_equal_numbers_take_no_memory_that_is_not_there(noise, tmp_path, monkeypatch, part):
     """Twenty million zeros fill a few kilobytes."""

@@ -384,6 +384,8 @@ def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
     source = cfg.clock or root / CLOCK_PATH
     try:
         known = read_clock(cfg.clock) if cfg.clock else read_episode_starts(root)
+    except FileNotFoundError:
+        known = None
     except OSError as error:
         raise ClockError(f"{source} cannot be read: {error}") from error
     if known is None:

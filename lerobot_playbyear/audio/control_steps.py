@@ -44,10 +44,6 @@ class ControlStepSound:
         self._last: Strip | None = None
         self.n_heard: int | None = None
 
-    def reset(self) -> None:
-        """The next step is the first one."""
-        self._last = None
-
     def next(self, strip: Strip) -> tuple[np.ndarray, bool]:
         """The sound of the step that ends with a strip.
 

@@ -171,7 +171,7 @@ class SessionSound:
         return len(self._samples)
 
     def samples(self, start: int, stop: int) -> np.ndarray:
-        """Samples from one number to before another, (n,) int16; 0 before the first. The last one must be there."""
+        """Samples from one number to before another, (n,) int16; 0 where there are none."""
         return section(self._samples, start, stop).astype(np.int16)
 
 

@@ -128,6 +128,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         expert = cfg.expert.make(env)
         stack.callback(expert.close)
         _check_expert(cfg, expert)
+        expert = method.wrap(expert)
         facts = env_facts(env)
         features, fps, what = dataset_features(facts), facts.fps, f"--env.type={cfg.env.type}"
     else:
@@ -163,7 +164,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     if env is not None and cfg.env is not None:
         processors = (learner.preprocessor, learner.postprocessor)
         actor = PolicyActor(learner.unwrapped, cfg.env, *processors, learner.accelerator.autocast)
-        scene = Scene(env, actor, method.wrap(expert))
+        scene = Scene(env, actor, expert)
     return Loop(
         cfg, training, folder, state, learner, windows, demonstrations, corrections, batches, report, scene, method
     )

@@ -37,6 +37,7 @@ STATS_PATH = "meta/stats.json"
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """That every dataset of LeRobot's has."""
 
+_PATHS = {"data_path": DEFAULT_DATA_PATH, "video_path": DEFAULT_VIDEO_PATH}
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
 _READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
@@ -45,7 +46,7 @@ _LEAST_FPS, _MOST_FPS = 0.01, 1000
 
 
 class InfoError(InputError):
-    """A dataset's `meta/info.json` says what cannot be right, or claims what its files do not hold."""
+    """A dataset's `meta/info.json` says what cannot be right."""
 
 
 class OutsideError(InfoError):
@@ -274,6 +275,10 @@ def _check_fields(info: Info) -> None:
         for name in ("info", "video_info"):
             if not isinstance(feature.get(name) or {}, dict):
                 raise ValueError(f"the feature '{key}' has {name} {feature[name]!r}; wanted fields such as sample_rate")
+    for name, default in _PATHS.items():
+        is_needed = name == "data_path" or any(feature["dtype"] == "video" for feature in features.values())
+        if is_needed and not isinstance(info.get(name), str):
+            raise ValueError(f"{name} is {info.get(name)!r}; wanted {default!r}")
 
 
 def _is_count(value: Any) -> bool:
@@ -282,9 +287,9 @@ def _is_count(value: Any) -> bool:
 
 def _check_templates(root: Path, info: Info) -> None:
     keys = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
-    for name, default in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
+    for name, default in _PATHS.items():
         template = info.get(name)
-        if template is None and name == "video_path" and not keys:
+        if template is None and not keys:
             continue
         ending = PurePath(default).suffix
         if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or not template.endswith(ending):

@@ -34,11 +34,11 @@ _PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, M
 
 
 @contextlib.contextmanager
-def parsing(path: Path | None = None) -> Iterator[None]:
+def parsing(path: Path) -> Iterator[None]:
     """Tells bytes that are wrong from bytes that cannot be read now, in whatever pyarrow does within.
 
     Args:
-        path: The file that is read; None where it lies in memory.
+        path: The file that is read.
 
     Raises:
         ParquetDamageError: The bytes were read, and are not what a parquet file holds.
@@ -51,7 +51,7 @@ def parsing(path: Path | None = None) -> Iterator[None]:
         raise
     except _PARSE_ERRORS as error:
         if isinstance(error, OSError) and error.errno:  # pyarrow sets it where the system refused
-            raise OSError(error.errno, os.strerror(error.errno), error.filename or (path and str(path))) from error
+            raise OSError(error.errno, os.strerror(error.errno), error.filename or str(path)) from error
         if isinstance(error, MemoryError) and not _asks_for_the_impossible(error):
             raise
         raise ParquetDamageError(first_line(error)) from error

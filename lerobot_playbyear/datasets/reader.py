@@ -21,7 +21,7 @@ import pyarrow as pa
 
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input, first_line
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_keys, check_audio_features, is_depth
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, is_special, list_files
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.frame_rate import frame_rate
 from lerobot_playbyear.datasets.info import INDEX_COLUMNS, check_parts, file_inside, list_folder, nothing_in, read_info
@@ -377,7 +377,7 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
         MemoryError: There is no room for something.
     """
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
-    if os.path.lexists(folder / INFO_PATH):
+    if (folder / INFO_PATH).is_file() or is_special(folder / INFO_PATH):
         _refuse_damage(_look(folder))
         return True
     if list_folder(folder):  # LeRobot fetches into no folder that holds other files

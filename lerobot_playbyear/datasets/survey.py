@@ -30,7 +30,14 @@ from lerobot_playbyear.datasets.info import (
     parse_stats,
     read_info,
 )
-from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, are_alike, column_to_numpy, read_table
+from lerobot_playbyear.datasets.parquet import (
+    DataFile,
+    ParquetDamageError,
+    are_alike,
+    column_to_numpy,
+    parsing,
+    read_table,
+)
 from lerobot_playbyear.datasets.pictures import open_picture
 from lerobot_playbyear.datasets.remedies import repair_command, task_command
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
@@ -512,8 +519,9 @@ def _tasks_in_table(root: Path) -> tuple[dict[int, str], str | None]:
     if not is_listed(root, TASKS_PATH):
         return {}, "is missing"
     try:
-        table = read_table(path).to_pandas()  # as LeRobot does
+        with parsing(path):
+            table = read_table(path).to_pandas()
         known = dict(zip(table["task_index"].astype(int).tolist(), table.index.astype(str), strict=True))
-    except (pa.ArrowException, LookupError, ValueError, TypeError, OverflowError) as error:
+    except (LookupError, ValueError, TypeError, OverflowError) as error:
         return {}, f"cannot be read ({error})"
     return known, None if list(known) == list(range(len(known))) else "does not number its tasks from 0 on"

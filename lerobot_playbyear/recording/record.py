@@ -215,4 +215,5 @@ def _check_facts(facts: EnvFacts, cfg: RecordConfig) -> None:
     for option, fps in (("env", env.fps), ("dataset", cfg.dataset.fps)):
         if fps not in (None, facts.fps):
             runs = f"the environment runs at {facts.fps} steps per second"
-            raise InputError(f"--{option}.fps={fps}, but {runs}: give that, or leave it out.")
+            or_none = ", or leave it out" if option == "dataset" else ""
+            raise InputError(f"--{option}.fps={fps}, but {runs}: give that{or_none}.")

@@ -236,6 +236,8 @@ def _expert(cell: Cell) -> Row:
     from lerobot_playbyear.dagger.run_folder import RunFolder
 
     attempts = [line for folder in taught for line in RunFolder(folder).metrics() if line.get("kind") == "attempt"]
+    if not attempts:
+        return {}
     totals = totals_of(attempts)
     return {
         "kept": sum(line.get("outcome") == "kept" for line in attempts),

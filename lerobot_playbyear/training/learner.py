@@ -27,7 +27,13 @@ from lerobot.utils.random_utils import load_rng_state
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
-from lerobot_playbyear import compat
+from lerobot_playbyear.compat import (
+    eval_policy_all,
+    get_step_checkpoint_dir,
+    get_step_identifier,
+    save_checkpoint,
+    update_last_checkpoint,
+)
 from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.features import is_depth, number_names
 from lerobot_playbyear.datasets.files import INFO_PATH, parse_json
@@ -122,16 +128,16 @@ class Learner:
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
         """Write a checkpoint where lerobot-train would, and return its folder."""
-        folder = compat.get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
+        folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
         self.write_checkpoint(folder, cfg)
-        compat.update_last_checkpoint(folder)
+        update_last_checkpoint(folder)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
             push_checkpoint(folder, cfg.policy.repo_id, cfg.policy.private)
         return folder
 
     def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:
         """Write LeRobot's checkpoint into a folder."""
-        compat.save_checkpoint(
+        save_checkpoint(
             self.accelerator,
             cfg,
             checkpoint_dir=folder,
@@ -152,10 +158,10 @@ class Learner:
         assert cfg.env is not None
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg=cfg.env, policy_cfg=cfg.policy)
         envs = make_env(cfg.env, n_envs=cfg.eval.batch_size, use_async_envs=cfg.eval.use_async_envs)
-        videos = Path(str(cfg.output_dir)) / "eval" / f"videos_step_{compat.get_step_identifier(self.step, cfg.steps)}"
+        videos = Path(str(cfg.output_dir)) / "eval" / f"videos_step_{get_step_identifier(self.step, cfg.steps)}"
         try:
             with torch.no_grad(), self.accelerator.autocast():
-                info = compat.eval_policy_all(
+                info = eval_policy_all(
                     envs=envs,
                     policy=self.unwrapped,
                     env_preprocessor=env_preprocessor,

@@ -125,7 +125,8 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
     _check_place(cfg)
     _check_links(Path(str(cfg.output_dir)))
     check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
-    assert cfg.policy is not None  # or LeRobot would have refused it
+    if cfg.policy is None:
+        raise ValueError("No policy: give --preset=cpu or gpu, --policy.path, or --policy.type=playbyear.")
     if not isinstance(cfg.policy, PlaybyearConfig):
         raise ValueError(
             f"--policy.type={cfg.policy.type}: playbyear-train trains policies of --policy.type=playbyear alone; give that, "
