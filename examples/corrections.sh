@@ -7,8 +7,10 @@ folder=${1:-outputs/round}
 fps=${FPS:-20} task=${TASK:-Find the cube}
 robot=--config_path=${ROBOT:-$(dirname "$0")/so101.yaml}
 
+# LeRobot 0.6.1 uploads every fifth episode, whatever push_to_hub says, unless it is told otherwise.
 # Space pauses, Tab begins and ends a correction, Space goes on, Esc ends.
 lerobot-rollout --strategy.type=dagger --strategy.record_autonomous=true --policy.path="$POLICY" "$robot" \
+  --strategy.upload_every_n_episodes=1000000 --play_sounds=false \
   --fps="$fps" --task="$task" --dataset.repo_id=me/rollout_corrections --dataset.no_stamp=true \
   --dataset.root="$folder/corrections" --dataset.push_to_hub=false --dataset.video=false --dataset.fps="$fps"
 

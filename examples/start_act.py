@@ -75,6 +75,7 @@ def main() -> None:
     pictures = [batch[key] for key in keys if key.startswith(OBS_IMAGES)]
     size = min(tuple(each.shape[-2:]) for each in pictures)
     calibrate(policy.model.backbone, torch.cat([functional.interpolate(each, size, mode="area") for each in pictures]))
+    policy.config.device = ACTConfig().device  # where lerobot-train will learn
     for part in (policy, before, after):
         part.save_pretrained(given.folder)
 

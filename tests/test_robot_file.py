@@ -13,9 +13,11 @@ from lerobot.teleoperators import TeleoperatorConfig
 from support.shared import trained
 
 from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
+from lerobot_playbyear.scripts.command import for_robots
 
 FILE = Path(__file__).parents[1] / "examples" / "so101.yaml"
 DATA = ("--dataset.repo_id=me/demos", "--dataset.root=here/demos", "--dataset.single_task=Find the cube")
+PUT_OFF = "--strategy.upload_every_n_episodes=1000000"
 CORRECTING = ("--strategy.type=dagger", "--strategy.record_autonomous=true", *DATA)
 
 
@@ -53,6 +55,25 @@ def test_one_file_is_the_robot_of_every_command(kind, options, monkeypatch, tmp_
     if options:
         assert (cfg.dataset.root, cfg.dataset.single_task) == ("here/demos", "Find the cube")
     assert not options or kind is RecordConfig or isinstance(cfg.strategy, DAggerStrategyConfig)
+
+
+def test_no_command_of_ours_lets_lerobot_upload_what_was_not_to_be_pushed():
+    """LeRobot's dagger uploads every few episodes, whatever `push_to_hub` says; each of its commands puts that off."""
+    hint = for_robots("playbyear-dagger", ["--robot.type=so101_follower"]) or ""
+    root = FILE.parents[1]
+    pages = [
+        path.read_text()
+        for kind in ("docs/how_to/*.md", "docs/tutorials/*.md", "examples/*.sh")
+        for path in root.glob(kind)
+    ]
+    lines = [line for text in (hint, *pages) for line in text.replace("\\\n", " ").splitlines()]
+    commands = [line.split() for line in lines if line.startswith("lerobot-rollout --strategy.type=dagger")]
+    assert len(commands) == 4
+    for words in commands:
+        # Without record_autonomous it uploads when Enter is pressed.
+        assert {"--strategy.record_autonomous=true", PUT_OFF, "--dataset.push_to_hub=false"} <= set(words)
+    cfg = parsed(RolloutConfig, f"--policy.path={trained()}", f"--config_path={FILE}", *CORRECTING, PUT_OFF)
+    assert cfg.strategy.upload_every_n_episodes == 10**6
 
 
 def test_the_page_shows_the_file():

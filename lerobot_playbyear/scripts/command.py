@@ -158,8 +158,8 @@ def answer_at_once(command: str) -> None:
 _DATA = "--dataset.repo_id=... --dataset.root=... --dataset.push_to_hub=false --dataset.video=false"
 _ON_ROBOTS = {
     "playbyear-record": f"lerobot-record {{}} {_DATA} --dataset.single_task=... --dataset.fps=20",
-    "playbyear-dagger": "lerobot-rollout --strategy.type=dagger --strategy.record_autonomous=true {} --policy.path=... "
-    f"--fps=20 --task=... {_DATA} --dataset.fps=20",
+    "playbyear-dagger": "lerobot-rollout --strategy.type=dagger --strategy.record_autonomous=true "
+    f"--strategy.upload_every_n_episodes=1000000 {{}} --policy.path=... --fps=20 --task=... {_DATA} --dataset.fps=20",
     "playbyear-video": "lerobot-rollout {} --policy.path=... --fps=20 --duration=60",
 }
 """What LeRobot's command does on a robot, by ours that does it in a simulation; the robot's options stand in braces."""

