@@ -41,7 +41,6 @@ BORROWED = {
     "get_step_checkpoint_dir": ("lerobot.common.train_utils:get_step_checkpoint_dir", f"{_TRAINS} name a checkpoint"),
     "get_step_identifier": ("lerobot.common.train_utils:get_step_identifier", f"{_TRAINS} name a film"),
     "save_checkpoint": ("lerobot.common.train_utils:save_checkpoint", f"{_TRAINS} save"),
-    "update_last_checkpoint": ("lerobot.common.train_utils:update_last_checkpoint", f"{_TRAINS} save"),
     "WandBLogger": ("lerobot.common.wandb_utils:WandBLogger", f"{_TRAINS} report to W&B"),
     "reorder_convolution_weight": ("torch:ops.mkldnn._reorder_convolution_weight", _ACTS),
     "convolution_pointwise": ("torch:ops.mkldnn._convolution_pointwise", _ACTS),

@@ -8,6 +8,7 @@ import threading
 from pathlib import Path
 
 import av
+import lerobot.policies
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -19,7 +20,7 @@ from support.shared import ENV, TINY, run_in_process
 
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets.checkpoint_steps import check_steps
+from lerobot_playbyear.datasets.checkpoint_steps import RUN_PROGRAMS, check_steps, check_type
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import FolderLockedError, new_file, new_folder, write_atomically
 from lerobot_playbyear.datasets.pictures import video_pictures
@@ -97,7 +98,9 @@ def test_a_run_goes_on_through_no_link(finished, tmp_path, secret, name):
         command("--resume=true", f"--output_dir={run}")
 
 
-@pytest.mark.parametrize("name", ["checkpoints/000004", "checkpoints/000004/pretrained_model", "metrics.jsonl"])
+@pytest.mark.parametrize(
+    "name", ["checkpoints/000004", "checkpoints/000004/pretrained_model", "metrics.jsonl", "eval/videos"]
+)
 def test_training_writes_through_no_link(recorded, trained, tmp_path, secret, name):
     run = Path(shutil.copytree(trained.parents[2], tmp_path / "run", symlinks=True))
     (run / name).unlink(missing_ok=True)
@@ -397,18 +400,36 @@ def test_rows_without_whole_numbers_are_refused(noise, tmp_path, name, value):
 # What a checkpoint runs
 
 
-@pytest.mark.parametrize("file", ["policy_preprocessor.json", "policy_postprocessor.json"])
-def test_a_checkpoint_names_no_class_to_call(recorded, trained, tmp_path, file):
+FETCHES = {"registry_name": "action_tokenizer_processor", "config": {"action_tokenizer_name": "stranger/evil"}}
+
+
+@pytest.mark.parametrize(("file", "step"), [("policy_preprocessor.json", None), ("policy_postprocessor.json", FETCHES)])
+def test_a_checkpoint_runs_no_program(recorded, trained, tmp_path, file, step):
+    """Neither one that it names, nor one that LeRobot's step for tokens would fetch from the Hub."""
     checkpoint, ran = Path(shutil.copytree(trained, tmp_path / "policy")), tmp_path / "ran"
     saved = json.loads((checkpoint / file).read_text())
-    saved["steps"].insert(0, {"class": "subprocess.Popen", "config": {"args": ["touch", str(ran)]}})
+    saved["steps"].insert(0, step or {"class": "subprocess.Popen", "config": {"args": ["touch", str(ran)]}})
     (checkpoint / file).write_text(json.dumps(saved))
     data = ("--dataset.repo_id=tests/demos", f"--dataset.root={recorded}", "--steps=1")
     resumed = (f"--policy.path={checkpoint}", "--policy.push_to_hub=false", f"--output_dir={tmp_path / 'out'}")
     filmed = (*ENV, f"--policy.path={checkpoint}", f"--output={tmp_path / 'film.mp4'}")
     for said in (run_in_process(train, *data, *resumed, "--num_workers=0"), run_in_process(video, *filmed)):
-        assert "not registered by any package but names a class" in str(said)
+        assert "names a class to import or runs programs from the Hub" in str(said)
     assert not ran.exists()
+
+
+def test_policies_that_fetch_programs_are_known():
+    folder = Path(lerobot.policies.__file__).parent
+    found = [path for path in folder.rglob("*.py") if re.search(r"trust_remote_code\W+True", path.read_text())]
+    assert {path.relative_to(folder).parts[0] for path in found} == set(RUN_PROGRAMS)
+    with pytest.raises(InputError, match="type groot run programs from the Hub; nothing was loaded"):
+        check_type("groot")
+
+
+def test_a_checkpoint_that_cannot_be_had_now_is_not_one_without_processors(hub):
+    hub.fault = lambda *_: "cut"
+    with pytest.raises(InputError, match=r"cannot be had from the Hub now .*: nothing was loaded"):
+        check_steps("tester/policy")
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "[" * 9999, '{"steps": [1]}'])

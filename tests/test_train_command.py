@@ -1,6 +1,9 @@
 """playbyear-train learns what lerobot-train learns, and either continues the other's checkpoints."""
 
+import errno
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +14,11 @@ from safetensors.torch import load_file
 from support import shared
 from support.shared import run_in_process
 
+from lerobot_playbyear.hub.push import read_metrics
 from lerobot_playbyear.scripts.commands import train
 from lerobot_playbyear.training.command_line import PRESETS, RECIPES, apply_preset, preset_options
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
+from lerobot_playbyear.training.learner import Learner
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -89,6 +94,31 @@ def test_lerobot_train_and_playbyear_train_continue_each_other(trained, tmp_path
     run_in_process(train, "--resume=true", f"--config_path={config_of(theirs)}", "--steps=8")
 
     assert step_of(theirs.resolve()) == 8
+
+
+def test_a_checkpoint_is_written_as_a_whole_in_a_copied_run_too(trained, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)  # `last` is a folder in it
+    (run / "metrics.jsonl").write_text('{"kind": "training", "st')  # as after a power cut
+    checkpoints = run / "checkpoints"
+    options = ("--resume=true", f"--config_path={config_of(checkpoints / '000003')}", "--save_freq=6")
+    weights = checkpoints / "000006/pretrained_model/model.safetensors"
+    before = weights.read_bytes()
+
+    def fail(_: object, folder: Path, cfg: object) -> None:
+        (folder / "half").touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Learner, "write_checkpoint", fail)
+    with pytest.raises(OSError, match="No space left"):
+        run_in_process(train, *options, "--steps=6", f"--output_dir={run}")
+    assert weights.read_bytes() == before
+    monkeypatch.undo()
+    run_in_process(train, *options, "--steps=6", f"--output_dir={run}")
+    assert (checkpoints / "last").readlink() == Path("000006")
+    assert step_of(checkpoints / "last") == 6
+    assert {path.name for path in checkpoints.iterdir()} == {"000003", "000006", "last"}
+    assert {"training", "validation"} & {line["kind"] for line in read_metrics(run)}
 
 
 def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(trained, noise, tmp_path):

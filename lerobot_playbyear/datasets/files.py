@@ -161,9 +161,24 @@ def append_line(path: Path, line: str) -> None:
     Raises:
         OSError: It cannot be written, or is a link.
     """
-    new = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-    with os.fdopen(os.open(path, new, 0o666), "a") as file:
-        file.write(line + "\n")
+    new = os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    with os.fdopen(os.open(path, new, 0o666), "a+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - 1, 0))
+        begin = (
+            b"" if file.read(1) in (b"", b"\n") else b"\n"
+        )  # half a line, of a full disk or a power cut, stays alone
+        file.write(begin + line.encode() + b"\n")
+
+
+def replace_link(place: Path, name: str) -> None:
+    """Makes a link to a folder beside it, in place of the one that is there or, in a copy, of the folder that it named."""
+    link = place.with_name(place.name + PARTIAL)
+    link.unlink(missing_ok=True)
+    link.symlink_to(name)
+    if place.is_dir() and not place.is_symlink():
+        shutil.rmtree(place)
+    os.replace(link, place)
 
 
 def is_special(path: Path) -> bool:

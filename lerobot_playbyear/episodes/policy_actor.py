@@ -14,7 +14,7 @@ from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_proces
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION
 
-from lerobot_playbyear.datasets.checkpoint_steps import check_steps
+from lerobot_playbyear.datasets.checkpoint_steps import check_steps, check_type
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.play import Observation
 
@@ -73,6 +73,7 @@ def load_policy_actor(policy_cfg: PreTrainedConfig, env_cfg: EnvConfig) -> Polic
     Raises:
         InputError: Its processors have steps that nobody registered.
     """
+    check_type(policy_cfg.type)
     check_steps(str(policy_cfg.pretrained_path))
     policy = make_policy(cfg=policy_cfg, env_cfg=env_cfg)
     device = torch.device(str(policy.config.device))

@@ -22,9 +22,10 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineMod
 from huggingface_hub.utils import validate_repo_id
 
 from lerobot_playbyear.compat import card_writer
+from lerobot_playbyear.datasets.checkpoint_steps import check_type
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, first_line
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries_below, parse_json
-from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out, check_there
+from lerobot_playbyear.datasets.info import check_links, check_links_out, check_there
 from lerobot_playbyear.datasets.journal import locked
 from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.datasets.reader import SurveyedDataset
@@ -251,11 +252,12 @@ def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
     try:
         check_links_out(folder)
         config = PreTrainedConfig.from_pretrained(folder)
+        check_type(config.type)
         config.repo_id, config.device = repo_id, "cpu"
         config.license = options.license or (word(config.license) if config.license else None)
         config.tags = [*(config.tags or []), *(options.tags or [])]
         policy = get_policy_class(config.type).from_pretrained(folder, config=config)
-    except OutsideError as error:
+    except InputError as error:
         raise HubError(f"Not pushed. {error}") from error
     except Exception as error:  # whatever LeRobot, JSON or safetensors raise
         raise HubError(f"Not pushed. The policy in {folder} cannot be loaded: {reason(error)}.") from error

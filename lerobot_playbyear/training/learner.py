@@ -3,6 +3,7 @@
 import ctypes
 import logging
 import math
+import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ from lerobot.optim import load_optimizer_state, load_scheduler_state
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
 from lerobot.processor import NormalizerProcessorStep, PolicyProcessorPipeline, TransitionKey, create_transition
-from lerobot.utils.constants import ACTION, OBS_STR, TRAINING_STATE_DIR, TRAINING_STEP
+from lerobot.utils.constants import ACTION, LAST_CHECKPOINT_LINK, OBS_STR, TRAINING_STATE_DIR, TRAINING_STEP
 from lerobot.utils.random_utils import load_rng_state
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
@@ -32,11 +33,10 @@ from lerobot_playbyear.compat import (
     get_step_checkpoint_dir,
     get_step_identifier,
     save_checkpoint,
-    update_last_checkpoint,
 )
 from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.features import is_depth, number_names
-from lerobot_playbyear.datasets.files import INFO_PATH, parse_json
+from lerobot_playbyear.datasets.files import INFO_PATH, new_folder, parse_json, replace_link
 from lerobot_playbyear.datasets.remedies import without_feature
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
@@ -127,10 +127,13 @@ class Learner:
         return self.accelerator.unwrap_model(self.policy)
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
-        """Write a checkpoint where lerobot-train would, and return its folder."""
+        """Write a checkpoint where lerobot-train would, as a whole or not at all, and return its folder."""
         folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
-        self.write_checkpoint(folder, cfg)
-        update_last_checkpoint(folder)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with new_folder(folder) as partial:
+            self.write_checkpoint(partial, cfg)
+            shutil.rmtree(folder, ignore_errors=True)  # of an attempt that went further than what this one began with
+        replace_link(folder.with_name(LAST_CHECKPOINT_LINK), folder.name)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
             push_checkpoint(folder, cfg.policy.repo_id, cfg.policy.private)
         return folder

@@ -159,9 +159,9 @@ def _check_links(run: Path) -> None:
         InputError: A link stands there, other than LeRobot's own to the last checkpoint.
     """
     check_no_links(run, METRICS_NAME, *RUN_FOLDERS)
-    folder = run / CHECKPOINTS_DIR
-    there = [path for path in entries_below(folder) if path != folder / LAST_CHECKPOINT_LINK] if folder.is_dir() else []
-    check_no_links(run, *(str(path.relative_to(run)) for path in there))
+    folders = [run / name for name in (CHECKPOINTS_DIR, "eval") if (run / name).is_dir()]
+    there = [path.relative_to(run) for folder in folders for path in entries_below(folder)]
+    check_no_links(run, *(str(path) for path in there if path != Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK)))
 
 
 def _loss_of(
