@@ -15,8 +15,10 @@ import pytest
 from reproduce_factory import arguments, call, counted, rows, write_plan
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.reproduce.plan import Plan
+from lerobot_playbyear.datasets.journal import JOURNAL, STAGING
+from lerobot_playbyear.reproduce.plan import Plan, Step
 from lerobot_playbyear.reproduce.run import print_plan, print_status
+from lerobot_playbyear.reproduce.steps import carry_out
 from lerobot_playbyear.reproduce.table import Table, best_rate, told
 from lerobot_playbyear.scripts.command import OPTIONS_FILE, find_mistake
 from lerobot_playbyear.training.command_line import apply_preset
@@ -68,6 +70,20 @@ def test_killed_at_any_moment_it_goes_on(tmp_path):
     assert call(tmp_path, "run", "--jobs=2").returncode == 0
     assert len(rows(tmp_path)) == N_CELLS
     assert max(Counter(counted(tmp_path)).values()) <= 2, "what was noted as done is not done again"
+
+
+def write_json(path: Path, **content: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+
+
+def test_a_recording_that_was_killed_while_its_last_episode_was_moved_is_whole(tmp_path):
+    folder = tmp_path / "data"
+    write_json(folder / "meta/info.json", total_episodes=1)
+    write_json(folder / STAGING / "meta/info.json", total_episodes=2)
+    (folder / JOURNAL).touch()
+    carry_out(Step("record", folder, ("playbyear-record", "--dataset.num_episodes=2")))
+    assert json.loads((folder / "meta/info.json").read_text()) == {"total_episodes": 2}
 
 
 def test_two_runs_at_once_never_do_one_cell_twice(tmp_path):

@@ -23,6 +23,7 @@ from filelock import FileLock
 
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
 from lerobot_playbyear.datasets.files import parse_json, write_atomically
+from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, lock_dataset
 from lerobot_playbyear.reproduce.plan import Step
 
 _IMPORTED = (
@@ -99,6 +100,9 @@ def resumed(step: Step) -> list[str]:
     command, folder = list(step.command), step.folder
     given = dict(word.removeprefix("--").split("=", 1) for word in command if "=" in word)
     if command[0] == "playbyear-record":
+        if os.path.lexists(folder / JOURNAL):
+            with lock_dataset(folder):
+                finish_journal(folder)  # an episode that was killed while it was moved into place counts
         info = folder / "meta" / "info.json"
         there = parse_json(info.read_bytes())["total_episodes"] if info.is_file() else 0
         name = "--dataset.num_episodes="
