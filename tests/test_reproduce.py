@@ -86,6 +86,16 @@ def test_a_recording_that_was_killed_while_its_last_episode_was_moved_is_whole(t
     assert json.loads((folder / "meta/info.json").read_text()) == {"total_episodes": 2}
 
 
+def test_a_training_that_was_killed_before_its_checkpoint_was_linked_is_done(tmp_path):
+    checkpoints = tmp_path / "train/checkpoints"
+    for step in (2, 4):
+        write_json(checkpoints / f"00000{step}/pretrained_model/train_config.json")
+        write_json(checkpoints / f"00000{step}/training_state/training_step.json", step=step)
+        write_json(checkpoints / f"00000{step}/training_state/optimizer_param_groups.json")  # LeRobot's last
+    carry_out(Step("train", tmp_path / "train", ("playbyear-train", "--steps=4")))
+    assert (checkpoints / "last").resolve() == checkpoints / "000004"
+
+
 def test_two_runs_at_once_never_do_one_cell_twice(tmp_path):
     write_plan(tmp_path, seconds=0.05)
     both = [subprocess.Popen(arguments(tmp_path, "run"), stdout=subprocess.PIPE, text=True) for _ in range(2)]

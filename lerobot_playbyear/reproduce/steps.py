@@ -111,6 +111,10 @@ def resumed(step: Step) -> list[str]:
     if command[0] == "playbyear-train":
         last = folder / "checkpoints" / "last"
         options = last / "pretrained_model" / "train_config.json"
+        complete = sorted(last.parent.glob("[0-9]*/training_state/optimizer_param_groups.json"))
+        if complete and not options.is_file():  # it was killed before it had linked the newest
+            last.unlink(missing_ok=True)
+            last.symlink_to(complete[-1].parents[1].name)
         if options.is_file():
             step_ = parse_json((last / "training_state" / "training_step.json").read_bytes())["step"]
             return [] if step_ >= int(given["steps"]) else [command[0], "--resume=true", f"--config_path={options}"]
