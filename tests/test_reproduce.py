@@ -6,6 +6,7 @@ import random
 import re
 import shlex
 import subprocess
+import sys
 import time
 from collections import Counter
 from html.parser import HTMLParser
@@ -104,6 +105,21 @@ def test_two_runs_at_once_never_do_one_cell_twice(tmp_path):
     told = re.findall(r"^(parts/\S+): ", "\n".join(said), re.MULTILINE)
     assert (len(told), len(set(told))) == (N_CELLS, N_CELLS)
     assert max(Counter(counted(tmp_path)).values()) == 1
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a disk that is full")
+def test_a_fork_that_cannot_say_anything_ends_all_the_same():
+    program = """
+import os, sys
+from lerobot_playbyear.reproduce.steps import forked
+sys.stdout = open("/dev/full", "w")
+try:
+    os.waitpid(forked(lambda: print("said") or 0), 0)
+finally:
+    os.write(2, b"one process is here\\n")
+"""
+    done = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, check=False)
+    assert done.stderr.count("one process is here") == 1
 
 
 def test_what_failed_is_told_and_tried_again(tmp_path):

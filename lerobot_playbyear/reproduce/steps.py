@@ -141,7 +141,7 @@ def in_a_fork(command: list[str], log: Path, threads: int) -> int:
 def forked(work: Callable[[], int]) -> int:
     """Starts a copy of this process that does some work and ends with its status; on Linux also when this process ends.
 
-    Elsewhere what outlives this process keeps its locks, so that nobody else begins its work.
+    Elsewhere it may outlive this process, whose locks it does not keep: wait for it before the same is begun again.
 
     Returns:
         The copy's number.
@@ -163,8 +163,9 @@ def forked(work: Callable[[], int]) -> int:
         except BaseException:
             traceback.print_exc()
         finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
+            for stream in (sys.stdout, sys.stderr):  # a full disk, or a pipe that nobody reads
+                with contextlib.suppress(BaseException):
+                    stream.flush()
             os._exit(status)
     return pid
 
