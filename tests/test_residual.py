@@ -85,3 +85,17 @@ def test_the_actor_waits_for_the_critic_and_a_run_goes_on_where_it_was_killed(tm
     folder = learn(config(tmp_path, **options))
     assert [steps for steps, _ in weights[6:]] == [24, 28, 32, 36, 40]
     assert load_file(folder / "model.safetensors").keys() == first.keys()
+
+
+def test_with_other_steps_it_goes_on_and_forgets_nothing(tmp_path, monkeypatch):
+    n_remembered = []
+    kept = residual._kept
+
+    def note(model):
+        n_remembered.append(model.replay_buffer.size())
+        return kept(model)
+
+    monkeypatch.setattr(residual, "_kept", note)
+    for steps in (20, 30, 10):  # it fills the first memory, leaves room in the second, is too much for the third
+        learn(config(tmp_path, steps=steps, warmup_steps=10, batch_size=4))
+    assert n_remembered[-5:] == [20, 23, 26, 29, 30]

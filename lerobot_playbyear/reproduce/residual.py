@@ -226,10 +226,12 @@ def _restore(model: Any, path: Path) -> None:
         progress = json.loads(file.metadata()["progress"])
     model.policy.load_state_dict({name[7:]: value for name, value in tensors.items() if name.startswith("policy.")})
     model.log_ent_coef.data.copy_(tensors["log_ent_coef"])
-    buffer, n = model.replay_buffer, len(tensors["seen.rewards"])
+    buffer = model.replay_buffer  # of another size, where --steps is another
+    n = min(len(tensors["seen.rewards"]), buffer.buffer_size)
     for name in _SEEN:
-        getattr(buffer, name)[:n] = tensors[f"seen.{name}"].numpy()
-    buffer.pos, buffer.full = progress["pos"], n == buffer.buffer_size
+        getattr(buffer, name)[:n] = tensors[f"seen.{name}"][:n].numpy()
+    buffer.full = n == buffer.buffer_size
+    buffer.pos = progress["pos"] % n if buffer.full else n
     model.num_timesteps = progress["steps"]
 
 
