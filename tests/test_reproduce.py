@@ -190,6 +190,33 @@ def test_a_strangers_row_names_no_other_file(tmp_path):
     assert not (tmp_path / "outside.jsonl").exists()
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"task": ["x"]},
+        {"successes": 5},
+        {"machine": 5},
+        {"minutes": {"record": "x"}},
+        {"curve": [{"at": 1}]},
+        {"players": {"expert": {"kind": "expert"}}},
+    ],
+)
+def test_a_strangers_row_that_no_page_can_show_is_named_and_not_taken_in(tmp_path, wrong):
+    row = {"study": "parts", "task": "t", "variant": "v", "seed": 1, "size": "cpu", "commands": []}
+    (tmp_path / "parts.jsonl").write_text(json.dumps(row | wrong) + "\n")
+    with pytest.raises(InputError, match=r"parts.jsonl:1 is damaged: "):
+        Table(tmp_path / "here").merge(Table(tmp_path))
+
+
+def test_a_row_without_figures_is_shown(tmp_path):
+    write_plan(tmp_path)
+    (tmp_path / "results").mkdir()
+    row = {"study": "parts", "task": "Grasp", "variant": "full", "seed": 1, "size": "tiny"}
+    (tmp_path / "results/parts.jsonl").write_text(json.dumps(row) + "\n")
+    assert call(tmp_path, "report").returncode == 0
+    assert "1 of 12 cells are done" in (tmp_path / "out/tiny/report.md").read_text()
+
+
 class _Page(HTMLParser):
     """What a page asks of others."""
 

@@ -55,16 +55,8 @@ def gathered(plan: Plan, table: Table) -> dict[str, Any]:
         tasks = dict.fromkeys(cell.task for cell, _ in own)
         parts = [_task([each for each in own if each[0].task == task], task, content) for task in tasks]
         studies.append({"title": content["title"], "about": content["about"], "tasks": parts})
-    folder = plan.output / plan.size
-    return {
-        "size": plan.size,
-        "folder": folder,
-        "n": len(found),
-        "n_done": len(done),
-        "studies": studies,
-        "machines": _machines(done),
-        "done": done,
-    }
+    figures = {"n": len(found), "n_done": len(done), "studies": studies, "machines": _machines(done), "done": done}
+    return {"size": plan.size, "folder": plan.output / plan.size, **figures}
 
 
 def _task(found: Found, task: str, study: dict[str, Any]) -> dict[str, Any]:
@@ -85,7 +77,7 @@ def _task(found: Found, task: str, study: dict[str, Any]) -> dict[str, Any]:
         "modes": list(dict.fromkeys(mode for count in failures.values() for mode in count)),
         "failures": {variant: count for variant, count in failures.items() if count},
         "expert": [
-            (f"{variant}, seed {row['seed']}", [row["expert"][name] for name in _EXPERT])
+            (f"{variant}, seed {row['seed']}", [row["expert"].get(name, "") for name in _EXPERT])
             for variant, rows in done.items()
             for row in rows
             if row.get("expert")
@@ -103,7 +95,7 @@ def _line(variant: str, rows: Sequence[Row | None], study: dict[str, Any]) -> di
     if not done:
         return line
     if "players" in done[0]:
-        players = [(name, each) for row in done for name, each in row["players"].items()]
+        players = [(name, each) for row in done for name, each in row.get("players", {}).items()]
         told = [
             f"{name} ({each['kind']}) {100 * each['successes'] / each['n_episodes']:.0f} %" for name, each in players
         ]
@@ -114,7 +106,7 @@ def _line(variant: str, rows: Sequence[Row | None], study: dict[str, Any]) -> di
         groups[what] = groups.get(what, "") + successes
     apart = [f"{what} {bits.count('1')} of {len(bits)}" for what, bits in groups.items()]
     if first := study.get("first"):  # episodes that are told apart, too
-        begun = [row["successes"][:first].count("1") for row in done]
+        begun = [row.get("successes", "")[:first].count("1") for row in done]
         apart.append(f"first {first} episodes: {', '.join(map(str, begun))}")
     best = [value for value in map(best_rate, done) if value is not None]
     return {

@@ -178,16 +178,9 @@ def do(cell: Cell, table: Table, threads: int = 1) -> Row | None:
             carry(step)
         row = _evaluated(cell, carry) if cell.candidates else _of_players(cell)
         size = {key: cell.values[key] for key in ("n", "steps", "kept", "n_held_out") if key in cell.values}
-        row = {
-            **{name: getattr(cell, name) for name in KEY},
-            **row,
-            "values": size,
-            "commands": commands,
-            "minutes": {name: round(spent, 2) for name, spent in minutes.items()},
-            "threads": threads,
-            "versions": versions(),
-            "machine": machine(),
-        }
+        row = {**{name: getattr(cell, name) for name in KEY}, **row, "values": size, "commands": commands}
+        row |= {"minutes": {name: round(spent, 2) for name, spent in minutes.items()}, "threads": threads}
+        row |= {"versions": versions(), "machine": machine()}
         table.put([row])
         return row
 

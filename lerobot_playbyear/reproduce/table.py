@@ -21,6 +21,16 @@ Row = dict[str, Any]
 KEY = ("study", "task", "variant", "seed", "size")
 """What a row is about; there is one of each."""
 
+_KINDS: Row = {
+    **dict.fromkeys(("successes", "acted_early"), str),
+    **dict.fromkeys(("best", "groups", "versions"), (dict, str)),
+    **dict.fromkeys(("minutes", "expert"), (dict, int | float)),
+    **{"commands": (list, str), "failures": (dict, int), "machine": dict},
+    **{"curve": (list, {"at": int, "choice": str})},
+    "players": (dict, {"kind": str, "successes": int, "n_episodes": int}),
+}
+"""What else a row may have: a kind, many of a kind, or parts by name."""
+
 
 class Table:
     """The tables in a folder; several processes may add rows to them.
@@ -88,17 +98,27 @@ def _read(path: Path) -> list[Row]:
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         try:
             row = dict(parse_json(line))
-            key_of(row)
+            hash(key_of(row))
             if row["study"] != path.stem:  # a study names the file that its rows are written to
                 raise ValueError(f"its study is {row['study']!r}, wanted {path.stem!r}")
-            if not isinstance(row.get("minutes", {}), dict):
-                raise ValueError(f"its minutes are {row['minutes']!r}, wanted those of each step by name")
+            for name, kind in _KINDS.items():
+                if name in row and not _is(row[name], kind):
+                    raise ValueError(f"its {name} cannot be {row[name]!r}")
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(
                 f"{path}:{number} is damaged: {error}. Put it back from a copy, or remove the line."
             ) from error
         rows.append(row)
     return rows
+
+
+def _is(value: Any, kind: Any) -> bool:
+    if isinstance(kind, tuple):
+        parts = value.values() if isinstance(value, dict) else value
+        return isinstance(value, kind[0]) and all(_is(each, kind[1]) for each in parts)
+    if isinstance(kind, dict):
+        return isinstance(value, dict) and all(_is(value.get(name), each) for name, each in kind.items())
+    return isinstance(value, kind)
 
 
 # What rows hold
