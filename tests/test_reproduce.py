@@ -13,6 +13,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+import yaml
 from reproduce_factory import arguments, call, counted, rows, write_plan
 
 from lerobot_playbyear.datasets.errors import InputError
@@ -217,6 +218,27 @@ def test_a_row_without_figures_is_shown(tmp_path):
     assert "1 of 12 cells are done" in (tmp_path / "out/tiny/report.md").read_text()
 
 
+def test_a_strangers_names_do_nothing_on_a_page_or_in_a_terminal(tmp_path):
+    row = {"study": "parts", "task": "Grasp", "variant": "full", "seed": 1, "size": "tiny"}
+    row["players"] = {"<b>|": {"kind": "expert", "successes": 1, "n_episodes": 2}}
+    row["machine"] = {"processor": "[fast](http://x)"}
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/parts.jsonl").write_text(json.dumps(row) + "\n")
+    path = write_plan(tmp_path)
+    plan = yaml.safe_load(path.read_text())
+    plan["steps"]["train"]["command"] += " \x1b[2K"
+    plan["studies"]["parts"]["tasks"]["\x1b[2K"] = {}
+    path.write_text(yaml.safe_dump(plan))
+    assert call(tmp_path, "report").returncode == 0
+    text = (tmp_path / "out/tiny/report.md").read_text()
+    assert r"| \<b\>\| (expert) 50 % |" in text
+    assert r"cells on \[fast\](http\://x)" in text
+    said = [call(tmp_path, action) for action in ("plan", "status")]
+    assert [each.returncode for each in said] == [0, 0]
+    assert "\x1b" not in said[0].stdout + said[1].stdout
+    assert r"parts/\x1b[2K/full" in said[0].stdout
+
+
 class _Page(HTMLParser):
     """What a page asks of others."""
 
@@ -236,7 +258,7 @@ def test_the_report_shows_what_there_is_and_says_what_is_missing(tmp_path):
     assert call(tmp_path, "report").returncode == 0
     text = (tmp_path / "out/tiny/report.md").read_text()
     assert "3 of 12 cells are done" in text
-    assert "| full | 67 ± 0 %; first 2 episodes: 2, 2 | 67 ± 0 % | 33 ± 0 % | 100 ± 0 % | 2 of 2 | 70 % |" in text
+    assert r"| full | 67 ± 0 %; first 2 episodes\: 2, 2 | 67 ± 0 % | 33 ± 0 % | 100 ± 0 % | 2 of 2 | 70 % |" in text
     assert "| no_interventions | not run |  |  |  | 0 of 2 |  |" in text
     assert "| failures of the last checkpoint | dropped |" in text
     page = _Page()

@@ -13,6 +13,7 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
+from lerobot_playbyear.datasets import markdown
 from lerobot_playbyear.datasets.files import new_file
 from lerobot_playbyear.reproduce.plan import Cell, Plan
 from lerobot_playbyear.reproduce.table import KEY, Row, Table, best_rate, key_of, mean_and_error, rate
@@ -34,7 +35,8 @@ def write_report(plan: Plan, table: Table) -> list[Path]:
         environment = Environment(
             autoescape=ending == "html", trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
         )
-        environment.filters |= {"shown": _shown, "base64": lambda path: base64.b64encode(path.read_bytes()).decode()}
+        environment.filters |= {"shown": _shown, "escaped": markdown.text}
+        environment.filters["base64"] = lambda path: base64.b64encode(path.read_bytes()).decode()
         template = files("lerobot_playbyear.reproduce") / f"report.{ending}"
         path = plan.output / plan.size / f"report.{ending}"
         with new_file(path) as partial:

@@ -145,7 +145,7 @@ def work(cell: Cell, cfg: ReproduceConfig) -> int:
     except Exception as error:
         told = str(error) if isinstance(error, PlaybyearError) else traceback.format_exc()
         write_atomically(failure, json.dumps({"error": told}, indent=1))
-        print(f"FAILED {cell.name}: {printable(told)}", flush=True)
+        print(printable(f"FAILED {cell.name}: {told}"), flush=True)
         return _FAILED
     failure.unlink(missing_ok=True)
     if row is not None:
@@ -269,21 +269,21 @@ def print_plan(cells: Sequence[Cell], table: Table) -> None:
     known: set[Path] = set()
     needed: Counter[str] = Counter()
     for cell in cells:
-        print(f"\n# {cell.name}{' (done)' if is_done(cell, table) else ''}")
+        print(f"\n# {printable(cell.name, '')}{' (done)' if is_done(cell, table) else ''}")
         candidates = cell.candidates
         choice = [cell.evaluation("choice", each) for each in candidates] if len(candidates) > 1 else []
         for step in (*cell.steps, *choice, *(cell.evaluation("held_out", each) for each in candidates)):
             if step.folder in known:
-                print(f"# as above: {step.folder}")
+                print(f"# as above: {printable(step.folder, '')}")
                 continue
             known.add(step.folder)
             is_sure = "held_out" not in step.folder.name or step.folder.name.endswith("-last")
-            print(step.shown if is_sure else f"# if it is among the best {_N_BEST}:\n{step.shown}")
+            print(printable(step.shown if is_sure else f"# if it is among the best {_N_BEST}:\n{step.shown}"))
             needed[step.name] += not is_done(cell, table)
     cost = sum(n * statistics.median(measured[name]) for name, n in needed.items() if name in measured)
     print(f"\n{len(cells)} cells. What is missing takes about {cost / 60:.1f} hours of a core.")
     if unknown := sorted(needed.keys() - measured.keys()):
-        print(f"Not measured yet, and not counted: {', '.join(unknown)}.")
+        print(f"Not measured yet, and not counted: {printable(', '.join(unknown))}.")
 
 
 def print_status(cells: Sequence[Cell], table: Table) -> None:
@@ -294,6 +294,6 @@ def print_status(cells: Sequence[Cell], table: Table) -> None:
         counts.setdefault(cell.study, Counter())[state] += 1
         if state == "failed":
             error = str(parse_json((cell.folder / "failed.json").read_bytes())["error"])
-            print(f"failed: {cell.name}: {printable(error).splitlines()[0]}")
+            print(printable(f"failed: {cell.name}: {error}").splitlines()[0])
     for study, states in counts.items():
-        print(f"{study:<16}" + ", ".join(f"{n} {state}" for state, n in states.items()))
+        print(printable(f"{study:<16}") + ", ".join(f"{n} {state}" for state, n in states.items()))
