@@ -317,6 +317,26 @@ def test_jobs_of_submitit_do_the_same(tmp_path):
     assert max(Counter(counted(tmp_path)).values()) == 1
 
 
+def test_an_output_folder_may_have_any_name(tmp_path):
+    write_plan(tmp_path)
+    folder = tmp_path / "it's my $out"
+    done = call(tmp_path, "run", "--only=Grasp/no_interventions/seed=1", f"--output_dir={folder}")
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert counted(tmp_path)[:2] == [str(folder / "tiny/data/Grasp"), str(folder / "tiny/train/Grasp-full-1")]
+
+
+@pytest.mark.parametrize("name", ["/$task", "../..", "data/../..", ""])
+def test_a_folder_that_leads_out_of_the_outputs_is_refused(tmp_path, name):
+    path = write_plan(tmp_path)
+    plan = yaml.safe_load(path.read_text())
+    plan["steps"]["train"]["folder"] = name
+    path.write_text(yaml.safe_dump(plan))
+    refused = call(tmp_path, "run")
+    assert refused.returncode == 1
+    assert f"'{name.replace('$task', 'Grasp')}' is no folder below {tmp_path / 'out/tiny'}" in refused.stderr
+    assert not (tmp_path / "count").exists()
+
+
 def test_without_submitit_a_cluster_is_refused(tmp_path):
     write_plan(tmp_path)
     (tmp_path / "submitit.py").write_text("raise ImportError('blocked')\n")

@@ -75,7 +75,14 @@ class Cell:
     @property
     def folder(self) -> Path:
         """Of what is its alone: evaluations, films, its lock."""
-        return self.plan.output / self.size / "cells" / self.name
+        return self._below(f"cells/{self.name}")
+
+    def _below(self, name: str) -> Path:
+        """A folder of this size: it may be removed, so that nothing else may be it."""
+        place = Path(self.size, name)
+        if place.is_absolute() or ".." in place.parts or place == Path(self.size):
+            raise InputError(f"{self.name}: '{name}' is no folder below {self.plan.output / self.size}.")
+        return self.plan.output / place
 
     @property
     def _course(self) -> list[str]:
@@ -89,8 +96,6 @@ class Cell:
         """
         values = {**self.values, **more}
         for _ in range(_MOST_NESTED):
-            if "$" not in text:
-                break
             try:
                 text = Template(text).substitute(values)
             except (KeyError, ValueError) as error:
@@ -104,7 +109,7 @@ class Cell:
         steps = []
         for name in self._course:
             template = self.plan.text["steps"][name]
-            folder = self.plan.output / self.size / self.fill(template["folder"])
+            folder = self._below(self.fill(template["folder"]))
             made |= {name: folder, f"{name}_last": _policy(folder, "last")}
             steps.append(Step(name, folder, self._words(template["command"], folder=folder, **made)))
         return steps
@@ -158,7 +163,9 @@ class Cell:
     def _words(self, text: str, **values: Any) -> tuple[str, ...]:
         shared = {name: text for name, text in self.plan.text.items() if isinstance(text, str)}
         own = {**shared, "options": self.plan.text["policies"][self.values["policy"]]}
-        return tuple(shlex.split(self.fill(text, **own, **values)))
+        later = {name: f"${{{name}}}" for name in values}  # a folder's name is no part of what is split
+        words = shlex.split(self.fill(text, **own, **later))
+        return tuple(Template(word).safe_substitute(values) for word in words)
 
 
 class Plan:

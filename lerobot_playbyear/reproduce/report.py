@@ -111,13 +111,10 @@ def _line(variant: str, rows: Sequence[Row | None], study: dict[str, Any]) -> di
         begun = [row.get("successes", "")[:first].count("1") for row in done]
         apart.append(f"first {first} episodes: {', '.join(map(str, begun))}")
     best = [value for value in map(best_rate, done) if value is not None]
-    return {
-        **line,
-        "success": "; ".join([_shown(best), *apart]),
-        "last": [rate(row["successes"]) for row in done if row.get("successes")],
-        "early": [rate(row["acted_early"]) for row in done if row.get("acted_early")],
-        "same": [statistics.mean(curve[-_N_BEST:]) for curve in curves],
-    }
+    for name, bits in (("last", "successes"), ("early", "acted_early")):
+        line[name] = [rate(row[bits]) for row in done if row.get(bits)]
+    same = [statistics.mean(curve[-_N_BEST:]) for curve in curves]
+    return {**line, "success": "; ".join([_shown(best), *apart]), "same": same}
 
 
 def _curve(rows: Iterable[Row]) -> dict[int, tuple[float, float | None]]:

@@ -149,8 +149,7 @@ def forked(work: Callable[[], int]) -> int:
     parent = os.getpid()
     sys.stdout.flush()
     sys.stderr.flush()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the threads that libraries keep: none of them is at work yet
+    with warnings.catch_warnings(action="ignore"):  # of the threads that libraries keep: none of them is at work yet
         pid = os.fork()
     if pid == 0:
         status = 1
