@@ -182,6 +182,12 @@ def test_who_acted_early_is_told_where_the_task_tells_it_of_every_attempt(tmp_pa
     assert "acted_early" not in told(path, 1, 2)
 
 
+def test_an_attempt_that_is_missing_is_told_with_all_that_is_to_be_removed(tmp_path):
+    path = tmp_path / "held_out-train-last/attempts.jsonl"
+    with pytest.raises(InputError, match=rf"Remove {path.parent} and {path.parent}.done.json\."):
+        told(path, 1, 1)
+
+
 def test_a_strangers_row_names_no_other_file(tmp_path):
     there, row = tmp_path / "there", {"task": "t", "variant": "v", "seed": 1, "size": "cpu"}
     there.mkdir()

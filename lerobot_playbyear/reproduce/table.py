@@ -25,8 +25,7 @@ _KINDS: Row = {
     **dict.fromkeys(("successes", "acted_early"), str),
     **dict.fromkeys(("best", "groups", "versions"), (dict, str)),
     **dict.fromkeys(("minutes", "expert"), (dict, int | float)),
-    **{"commands": (list, str), "failures": (dict, int), "machine": dict},
-    **{"curve": (list, {"at": int, "choice": str})},
+    **{"commands": (list, str), "curve": (list, {"at": int, "choice": str}), "failures": (dict, int), "machine": dict},
     "players": (dict, {"kind": str, "successes": int, "n_episodes": int}),
 }
 """What else a row may have: a kind, many of a kind, or parts by name."""
@@ -140,7 +139,8 @@ def told(path: Path, first_seed: int, n: int) -> Row:
     missing = [seed for seed in range(first_seed, first_seed + n) if seed not in by_seed]
     if missing:
         raise InputError(
-            f"{path} lacks the attempt of seed {missing[0]}, and {len(missing) - 1} others. Remove its folder."
+            f"{path} lacks the attempt of seed {missing[0]}, and {len(missing) - 1} others. "
+            f"Remove {path.parent} and {path.parent}.done.json."
         )
     own = [by_seed[seed] for seed in range(first_seed, first_seed + n)]
     groups: dict[str, str] = {}
