@@ -22,7 +22,7 @@ from pathlib import Path
 from filelock import FileLock
 
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
-from lerobot_playbyear.datasets.files import parse_json, write_atomically
+from lerobot_playbyear.datasets.files import parse_json, replace_link, write_atomically
 from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, lock_dataset
 from lerobot_playbyear.reproduce.plan import Step
 
@@ -113,8 +113,7 @@ def resumed(step: Step) -> list[str]:
         options = last / "pretrained_model" / "train_config.json"
         complete = sorted(last.parent.glob("[0-9]*/training_state/optimizer_param_groups.json"))
         if complete and not options.is_file():  # it was killed before it had linked the newest
-            last.unlink(missing_ok=True)
-            last.symlink_to(complete[-1].parents[1].name)
+            replace_link(last, complete[-1].parents[1].name)
         if options.is_file():
             step_ = parse_json((last / "training_state" / "training_step.json").read_bytes())["step"]
             return [] if step_ >= int(given["steps"]) else [command[0], "--resume=true", f"--config_path={options}"]
