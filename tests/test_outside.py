@@ -86,7 +86,7 @@ def _write(path: Path, text: str) -> None:
         partial.write_text(text)
 
 
-@pytest.mark.parametrize("name", ["checkpoints", "metrics.jsonl", "eval"])
+@pytest.mark.parametrize("name", ["checkpoints", "metrics.jsonl", "eval", "attempts"])
 def test_a_run_goes_on_through_no_link(finished, tmp_path, secret, name):
     """Neither `playbyear-dagger`, which removes checkpoints that it no longer needs, nor `playbyear-train`."""
     run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"

@@ -22,6 +22,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from safetensors import SafetensorError
 
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
+from lerobot_playbyear.dagger.robot_gated import ATTEMPTS
 from lerobot_playbyear.datasets.errors import InputError, first_line
 from lerobot_playbyear.datasets.files import (
     PARTIAL,
@@ -162,7 +163,7 @@ class RunFolder:
             InputError: The folder holds a run and `resume` is off, or it holds something else, or a link where the run writes;
                 or its state is damaged.
         """
-        check_no_links(self.path, METRICS_NAME, *RUN_FOLDERS)
+        check_no_links(self.path, METRICS_NAME, ATTEMPTS, *RUN_FOLDERS)
         is_run = (self.path / CONFIG_NAME).is_file()
         begun = {LOCK, CONFIG_NAME + PARTIAL}  # of a run that could not write even its options
         names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
