@@ -119,6 +119,27 @@ def test_a_finished_run_stays_as_it_is(finished, tmp_path):
     assert (figures(tmp_path), state(tmp_path), len(seeds(finished))) == (figures(finished), state(finished), n_before)
 
 
+def copied(finished, folder):
+    """A finished run in a folder of its own, with its own attempts. Returns the output folder."""
+    shutil.copytree(finished, folder, symlinks=True, dirs_exist_ok=True)
+    config = folder / "out/dagger_config.json"
+    config.write_text(config.read_text().replace(str(finished), str(folder)))
+    return folder / "out"
+
+
+@pytest.mark.parametrize("left", ["metrics.jsonl", "checkpoints"])
+def test_a_run_that_lost_its_state_loses_nothing_else(finished, tmp_path, left):
+    out = copied(finished, tmp_path)
+    (out / "dagger_state.json").unlink()
+    if left == "checkpoints":
+        (out / "metrics.jsonl").unlink()
+    else:
+        shutil.rmtree(out / "checkpoints")
+    with pytest.raises(PlaybyearError, match=r"dagger_state\.json is missing: put it back from a copy, or choose another"):
+        dagger(tmp_path, *RUN, "--resume=true")
+    assert (out / left).stat().st_size
+
+
 def test_only_one_run_works_in_a_folder(tmp_path):
     at_work = folder_module.RunFolder(tmp_path / "out").locked()
     with at_work, pytest.raises(PlaybyearError, match="another playbyear-dagger is at work there"):

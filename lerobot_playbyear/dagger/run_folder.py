@@ -161,7 +161,7 @@ class RunFolder:
 
         Raises:
             InputError: The folder holds a run and `resume` is off, or it holds something else, or a link where the run writes;
-                or its state is damaged.
+                or its state is damaged or missing.
         """
         check_no_links(self.path, METRICS_NAME, ATTEMPTS, *RUN_FOLDERS)
         is_run = (self.path / CONFIG_NAME).is_file()
@@ -179,6 +179,8 @@ class RunFolder:
             )
         path = self.path / STATE_NAME
         if not path.is_file():
+            if self.metrics() or self.checkpoints.exists():  # the state is written before them
+                raise InputError(f"{path} is missing: put it back from a copy, or choose another --output_dir.")
             return None
         try:
             state = draccus.decode(RunState, parse_json(path.read_bytes()))
