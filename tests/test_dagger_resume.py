@@ -140,6 +140,16 @@ def test_a_run_that_lost_its_state_loses_nothing_else(finished, tmp_path, left):
     assert (out / left).stat().st_size
 
 
+def test_a_training_that_diverges_keeps_the_last_good_weights(finished, tmp_path):
+    out = copied(finished, tmp_path)
+    before, go_on = weights(tmp_path), ("--resume=true", f"--output_dir={out}", "--num_episodes=4", "--eval_every=0")
+    with pytest.raises(PlaybyearError, match=r"diverged in round 4: .* last good ones are .*/000004\. Go on .*=1e\+37"):
+        command(*go_on, "--learning_rate=1e38")
+    assert all(torch.equal(weights(tmp_path)[key], before[key]) for key in before)
+    command(*go_on, "--learning_rate=1e-4")
+    assert state(tmp_path)["checkpoint"] == "000006"
+
+
 def test_only_one_run_works_in_a_folder(tmp_path):
     at_work = folder_module.RunFolder(tmp_path / "out").locked()
     with at_work, pytest.raises(PlaybyearError, match="another playbyear-dagger is at work there"):

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import logging
+import math
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -78,7 +79,7 @@ class Loop:
         """Go on until the run is complete, or until the policy needs the expert no more.
 
         Raises:
-            PlaybyearError: No attempt succeeds even with the expert, or something cannot be written.
+            PlaybyearError: No attempt succeeds even with the expert, the training diverges, or something cannot be written.
         """
         if self.scene is not None:
             self.method.begin(self)
@@ -238,7 +239,23 @@ class Loop:
         with seconds.of("loss"):
             halves = self.batches.halves(_LOSS_BATCHES + self.state.round)
             figures["loss_demonstrations"], figures["loss_interventions"] = (learner.loss(half) for half in halves)
+        self._check_finite(figures)
         return {"n_updates": n_updates, **figures}
+
+    def _check_finite(self, figures: dict[str, float]) -> None:
+        """Refuses weights that nobody could act or go on with.
+
+        Raises:
+            InputError: The training diverged.
+        """
+        skipped = {"grad_norm"} if self.learner.accelerator.scaler else set()  # float16 leaves such an update out
+        endless = [f"{name} is {value}" for name, value in figures.items() if not math.isfinite(value) and name not in skipped]
+        if endless:
+            good = self.folder.checkpoint(self.state) or self.state.policy_path
+            raise InputError(
+                f"The training diverged in round {self.state.round + 1}: {endless[0]}. Its weights are not saved; the last good "
+                f"ones are {good}. Go on from them with --resume=true --learning_rate={self.cfg.largest_rate / 10:g}."
+            )
 
     def _finish_round(self, start: float, seconds: Seconds, losses: dict[str, Any]) -> None:
         """Saves the weights and makes the round count."""
