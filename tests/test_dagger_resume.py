@@ -183,6 +183,15 @@ def test_a_dataset_that_something_else_changed_is_refused(finished, tmp_path):
         command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--num_episodes=8")
 
 
+def test_a_disk_that_is_not_mounted_holds_no_new_dataset(finished, tmp_path):
+    out = copied(finished, tmp_path)
+    shutil.rmtree(tmp_path / "corrections")
+    (tmp_path / "corrections").mkdir()  # where it would be mounted
+    with pytest.raises(PlaybyearError, match="no dataset in .*corrections, and 3 attempts should be there. Is its disk"):
+        command("--resume=true", f"--output_dir={out}", "--num_episodes=4")
+    assert not list((tmp_path / "corrections").iterdir())
+
+
 # `checkpoints/best`: the weights of the best evaluation, which are kept until a better one comes
 
 
