@@ -150,6 +150,17 @@ def test_a_training_that_diverges_keeps_the_last_good_weights(finished, tmp_path
     assert state(tmp_path)["checkpoint"] == "000006"
 
 
+def test_a_run_whose_attempts_lie_in_its_folder_may_be_stopped_before_it_begins(tmp_path, monkeypatch):
+    run = (*RUN, "--resume=true", f"--interventions.root={tmp_path / 'out/attempts'}", "--num_episodes=1")
+    with monkeypatch.context() as patch:
+        fail_once(patch, folder_module.RunFolder, "begin", 0)
+        with pytest.raises(PowerCut):
+            dagger(tmp_path, *run)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["attempts"]
+    dagger(tmp_path, *run)
+    assert (tmp_path / "out/attempts/meta/info.json").is_file()
+
+
 def test_only_one_run_works_in_a_folder(tmp_path):
     at_work = folder_module.RunFolder(tmp_path / "out").locked()
     with at_work, pytest.raises(PlaybyearError, match="another playbyear-dagger is at work there"):

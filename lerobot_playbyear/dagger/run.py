@@ -55,7 +55,7 @@ def run_dagger(cfg: DaggerConfig) -> Path:
             _check_places(cfg)
             folder = RunFolder(cfg.output_dir)
             stack.enter_context(folder.locked())
-            state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
+            state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume, cfg.interventions.folder))
             loop = _make_loop(cfg, folder, state, stack)
         loop.run()
     _print_results(cfg, folder, state, loop)

@@ -150,11 +150,12 @@ class RunFolder:
             if is_new:
                 self.path.rmdir()
 
-    def claim(self, resume: bool) -> RunState | None:
+    def claim(self, resume: bool, interventions: Path) -> RunState | None:
         """Find out whether there is a run to go on with.
 
         Args:
             resume: Whether that is wanted.
+            interventions: Folder of the attempts, which may lie in this one, and may have been made before the run began.
 
         Returns:
             The state of the run, or None when a new one begins.
@@ -166,8 +167,9 @@ class RunFolder:
         check_no_links(self.path, METRICS_NAME, ATTEMPTS, *RUN_FOLDERS)
         is_run = (self.path / CONFIG_NAME).is_file()
         begun = {LOCK, CONFIG_NAME + PARTIAL}  # of a run that could not write even its options
-        names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
-        if {name for name in names if not is_trial(name)} <= begun:
+        paths = [path for path in self.path.iterdir() if not is_trial(path.name)] if self.path.exists() else []
+        own = interventions.resolve()
+        if {path.name for path in paths if path.resolve() not in (own, *own.parents)} <= begun:
             return None
         if not is_run:
             raise InputError(
