@@ -249,17 +249,19 @@ class Loop:
             InputError: The training diverged.
         """
         skipped = {"grad_norm"} if self.learner.accelerator.scaler else set()  # float16 leaves such an update out
-        endless = [f"{name} is {value}" for name, value in figures.items() if not math.isfinite(value) and name not in skipped]
+        endless = [
+            f"{name} is {value}" for name, value in figures.items() if not math.isfinite(value) and name not in skipped
+        ]
         if endless:
             good = self.folder.checkpoint(self.state) or self.state.policy_path
             raise InputError(
-                f"The training diverged in round {self.state.round + 1}: {endless[0]}. Its weights are not saved; the last good "
-                f"ones are {good}. Go on from them with --resume=true --learning_rate={self.cfg.largest_rate / 10:g}."
+                f"The training diverged in round {self.state.round + 1}: {endless[0]}. Its weights are not saved; the last "
+                f"good ones are {good}. Go on from them with --resume=true --learning_rate={self.cfg.largest_rate / 10:g}."
             )
 
     def _finish_round(self, start: float, seconds: Seconds, losses: dict[str, Any]) -> None:
         """Saves the weights and makes the round count."""
-        cfg, state = self.cfg, self.state
+        state = self.state
         state.round += 1
         if losses:
             self.report.doing("saving")
@@ -268,8 +270,6 @@ class Loop:
                 self.folder.save_checkpoint(name, lambda path: self.learner.write_checkpoint(path, self.training))
             state.checkpoint, state.step = name, self.learner.step
             state.made = [*dict.fromkeys([*state.made, name])]
-            if cfg.env is not None and is_due(state.round, cfg.eval_every):
-                state.milestones.append(name)
         total = time.perf_counter() - start
         spent = {} if self.scene is None else round_figures(self.folder.metrics(), state.round)
         self.report.write("round", {**losses, **spent, **_rounded(seconds), "total_s": round(total, 4)})
@@ -294,10 +294,9 @@ class Loop:
         seeds, is_trained = [cfg.seed, cfg.eval.n_episodes], state.checkpoint is not None or not cfg.new_weights
         is_best = state.best.get("seeds") != seeds or state.success >= state.best["success"]  # of equal ones the last
         if is_trained and is_best:
-            before = state.best.get("checkpoint")
-            if before is not None and state.best["seeds"] != seeds:  # it was not beaten: it solved other episodes
-                state.milestones.append(before)
             state.best = {"success": state.success, "checkpoint": state.checkpoint, "seeds": seeds}
+        if state.checkpoint is not None and state.checkpoint not in state.milestones:
+            state.milestones.append(state.checkpoint)
         self.report.write_evaluation(info, evaluation_s=round(time.perf_counter() - start, 3))
         self.folder.commit(state)
         self.folder.clean(state)

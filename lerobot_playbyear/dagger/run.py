@@ -272,8 +272,8 @@ def _check_interventions(cfg: DaggerConfig, n_known: int) -> None:
     folder = cfg.interventions.folder
     if cfg.is_online and n_known and not any(os.path.exists(folder / name) for name in ("meta", "data")):
         raise InputError(
-            f"There is no dataset in {folder}, and {n_known} attempts should be there. Is its disk mounted? Mount it, or put the "
-            "dataset back from a copy."
+            f"There is no dataset in {folder}, and {n_known} attempts should be there. Is its disk mounted? Mount it, or put "
+            "the dataset back from a copy."
         )
 
 
