@@ -38,7 +38,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SECRET = "what nobody else may read or change"
 
 
-ODD_STATES = ('{"policy_path": "x", "made": "000002"}', '{"policy_path": "x", "next_seed": -3}')
+ODD_STATES = (
+    *('{"policy_path": "x", "made": "000002"}', '{"policy_path": "x", "next_seed": -3}'),
+    *('{"policy_path": "x", "best": {"checkpoint": 5}}', '{"policy_path": "x", "best": {"seeds": [1, 2]}}'),
+)
 
 
 @pytest.fixture
@@ -128,7 +131,7 @@ def test_dagger_removes_only_checkpoints_of_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("field", ["made", "milestones", "checkpoint", "best"])
-@pytest.mark.parametrize("name", ["../../../home", "{home}", "..", ""])
+@pytest.mark.parametrize("name", ["../../../home", "{home}", "..", "", "last", "best"])
 def test_a_runs_state_names_no_folder_elsewhere(finished, tmp_path, secret, field, name):
     """Or else the folder that it says was made by the run would be removed."""
     run, name = (
@@ -136,7 +139,8 @@ def test_a_runs_state_names_no_folder_elsewhere(finished, tmp_path, secret, fiel
         name.format(home=secret.parent),
     )
     saved = json.loads((run / "dagger_state.json").read_text())
-    saved[field] = {"made": [name], "milestones": [name], "checkpoint": name, "best": {"checkpoint": name}}[field]
+    best = {**saved["best"], "checkpoint": name}
+    saved[field] = {"made": [name], "milestones": [name], "checkpoint": name, "best": best}[field]
     (run / "dagger_state.json").write_text(json.dumps(saved))
     with pytest.raises(InputError, match="names the checkpoint"):
         command("--resume=true", f"--output_dir={run}")
@@ -213,7 +217,7 @@ def test_lines_of_figures_that_say_nothing_are_dropped(finished, tmp_path):
     run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
     before = (run / "metrics.jsonl").read_text()
     odd = ['{"kind": "x"}', "[1]", '{"kind": ["eval"], "round": 0}', '{"kind": "attempt", "attempt": "a"}', "[" * 9999]
-    (run / "metrics.jsonl").write_text("\n".join([*odd, before]))
+    (run / "metrics.jsonl").write_text("\n".join([*odd, before]) + '{"kind": "attempt", "attempt": 1}\n')
     config = run / "dagger_config.json"  # the original's attempts may be locked by another test's run
     config.write_text(config.read_text().replace(str(finished), str(run.parent)))
     command("--resume=true", f"--output_dir={run}")

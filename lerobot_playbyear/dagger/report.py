@@ -96,14 +96,14 @@ def totals_of(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """What attempts cost together.
 
     Args:
-        lines: Lines of `metrics.jsonl`; those that are no attempts do not matter.
+        lines: Lines of `metrics.jsonl`; those without an attempt's figures do not matter.
 
     Returns:
         `attempts`, how many there were; `expert_steps`, in which the expert acted; `takeovers` and `switches` of control;
         `person_seconds` of a person's time; `autonomy`, the share of the steps in which the policy acted, 1 without an attempt.
     """
-    attempts = [line for line in lines if line.get("kind") == "attempt"]
     names = ("n_frames", "n_expert_steps", "n_takeovers", "n_switches", "person_seconds")
+    attempts = [line for line in lines if all(isinstance(line.get(name), int | float) for name in names)]
     steps, expert_steps, takeovers, switches, seconds = (sum(line[name] for line in attempts) for name in names)
     totals = {"attempts": len(attempts), "expert_steps": expert_steps, "takeovers": takeovers, "switches": switches}
     return totals | {"person_seconds": round(seconds, 2), "autonomy": 1 - expert_steps / steps if steps else 1.0}

@@ -46,9 +46,10 @@ BEST_LINK = "best"
 LOCK = ".lock"
 """File in the output folder while a run is at work."""
 
-_NAME = re.compile(r"[A-Za-z0-9_-]+")  # of a checkpoint's folder: one that leads nowhere else
+_NAME = re.compile(r"[0-9]+")  # of a checkpoint's folder: one that leads nowhere else, and is no link's
 
 _COUNTS = ("round", "step", "attempts", "kept", "failed", "unneeded", "discarded", "next_seed")
+_BEST = {"success": int | float, "seeds": list, "checkpoint": str | None}
 
 _SAME_RUN = (
     *("dataset", "interventions", "env", "expert", "method", "skip_s", "new_weights", "seed"),
@@ -188,13 +189,15 @@ class RunFolder:
             state = draccus.decode(RunState, parse_json(path.read_bytes()))
             if negative := [name for name in _COUNTS if getattr(state, name) < 0]:
                 raise ValueError(f"{negative[0]} is {getattr(state, negative[0])}; wanted 0 or more")
+            if state.best and not all(isinstance(state.best.get(name, ...), kind) for name, kind in _BEST.items()):
+                raise ValueError(f"best is {state.best}; wanted {', '.join(_BEST)}")
         except (ValueError, ParsingError) as error:
             raise InputError(
                 f"{path} is damaged: {first_line(error)}. Put it back from a copy, or begin another run with the corrections "
                 "that are there, in another --output_dir."
             ) from error
         said = [*state.made, *state.milestones, state.checkpoint, state.best.get("checkpoint")]
-        if strange := [name for name in said if name is not None and not _NAME.fullmatch(str(name))]:
+        if strange := [name for name in said if name is not None and not _NAME.fullmatch(name)]:
             raise InputError(
                 f"{path} names the checkpoint {strange[0]!r}; wanted names of folders in '{self.checkpoints}'."
             )
