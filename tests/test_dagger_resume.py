@@ -143,7 +143,9 @@ def test_a_run_that_lost_its_state_loses_nothing_else(finished, tmp_path, left):
 def test_a_training_that_diverges_keeps_the_last_good_weights(finished, tmp_path):
     out = copied(finished, tmp_path)
     before, go_on = weights(tmp_path), ("--resume=true", f"--output_dir={out}", "--num_episodes=4", "--eval_every=0")
-    with pytest.raises(PlaybyearError, match=r"diverged in round 4: .* last good ones are .*/000004\. Go on .*=1e\+37"):
+    with pytest.raises(
+        PlaybyearError, match=r"diverged in round 4: .* last good weights are .*/000004\. Go on .*=1e\+37"
+    ):
         command(*go_on, "--learning_rate=1e38")
     assert all(torch.equal(weights(tmp_path)[key], before[key]) for key in before)
     command(*go_on, "--learning_rate=1e-4")

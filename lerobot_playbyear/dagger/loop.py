@@ -214,7 +214,11 @@ class Loop:
         return self.cfg.updates_per_episode if is_warm else 0
 
     def _update(self, seconds: Seconds) -> dict[str, Any]:
-        """The round's updates. Returns losses and the like, none without updates."""
+        """The round's updates. Returns losses and the like, none without updates.
+
+        Raises:
+            InputError: The training diverged: nobody could act with these weights, or go on from them.
+        """
         n_updates = self._n_updates()
         if n_updates == 0:
             return {}
@@ -239,25 +243,15 @@ class Loop:
         with seconds.of("loss"):
             halves = self.batches.halves(_LOSS_BATCHES + self.state.round)
             figures["loss_demonstrations"], figures["loss_interventions"] = (learner.loss(half) for half in halves)
-        self._check_finite(figures)
-        return {"n_updates": n_updates, **figures}
-
-    def _check_finite(self, figures: dict[str, float]) -> None:
-        """Refuses weights that nobody could act or go on with.
-
-        Raises:
-            InputError: The training diverged.
-        """
-        skipped = {"grad_norm"} if self.learner.accelerator.scaler else set()  # float16 leaves such an update out
-        endless = [
-            f"{name} is {value}" for name, value in figures.items() if not math.isfinite(value) and name not in skipped
-        ]
+        skipped = {"grad_norm"} if learner.accelerator.scaler else set()  # float16 leaves such an update out
+        endless = [name for name in figures if name not in skipped and not math.isfinite(figures[name])]
         if endless:
-            good = self.folder.checkpoint(self.state) or self.state.policy_path
             raise InputError(
-                f"The training diverged in round {self.state.round + 1}: {endless[0]}. Its weights are not saved; the last "
-                f"good ones are {good}. Go on from them with --resume=true --learning_rate={self.cfg.largest_rate / 10:g}."
+                f"The training diverged in round {self.state.round + 1}: {endless[0]} is {figures[endless[0]]}. Nothing of it "
+                f"is saved; the last good weights are {self.folder.checkpoint(self.state) or self.state.policy_path}. Go on "
+                f"from them with --resume=true --learning_rate={self.cfg.largest_rate / 10:g}."
             )
+        return {"n_updates": n_updates, **figures}
 
     def _finish_round(self, start: float, seconds: Seconds, losses: dict[str, Any]) -> None:
         """Saves the weights and makes the round count."""

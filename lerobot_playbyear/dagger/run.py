@@ -88,7 +88,12 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
                 f"--output_dir={folder.path} holds another run: {'; '.join(changed)}. Leave these options out to go on "
                 "with it, or choose another folder."
             )
-        _check_interventions(cfg, (state.first_episodes or 0) + state.kept)
+        attempts, n_known = cfg.interventions.folder, (state.first_episodes or 0) + state.kept
+        if cfg.is_online and n_known and not any(os.path.exists(attempts / name) for name in ("meta", "data")):
+            raise InputError(
+                f"There is no dataset in {attempts}, and {n_known} attempts should be there. Is its disk mounted? Mount it, or "
+                "put the dataset back from a copy."
+            )
     checkpoint = folder.checkpoint(state)
     source = state.policy_path if checkpoint is None else str(checkpoint / PRETRAINED_MODEL_DIR)
     if checkpoint is None and overrides != state.policy_overrides:
@@ -260,20 +265,6 @@ def _check_places(cfg: DaggerConfig) -> None:
         raise InputError(
             f"--output_dir={cfg.output_dir} lies in the folder of --interventions, {interventions}, where a dataset is to be "
             "made: give another one."
-        )
-
-
-def _check_interventions(cfg: DaggerConfig, n_known: int) -> None:
-    """Refuse to make a new dataset where attempts of the run should be.
-
-    Raises:
-        InputError: There are none.
-    """
-    folder = cfg.interventions.folder
-    if cfg.is_online and n_known and not any(os.path.exists(folder / name) for name in ("meta", "data")):
-        raise InputError(
-            f"There is no dataset in {folder}, and {n_known} attempts should be there. Is its disk mounted? Mount it, or put "
-            "the dataset back from a copy."
         )
 
 

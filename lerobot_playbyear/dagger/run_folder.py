@@ -166,13 +166,12 @@ class RunFolder:
                 or its state is damaged or missing.
         """
         check_no_links(self.path, METRICS_NAME, ATTEMPTS, *RUN_FOLDERS)
-        is_run = (self.path / CONFIG_NAME).is_file()
-        begun = {LOCK, CONFIG_NAME + PARTIAL}  # of a run that could not write even its options
-        paths = [path for path in self.path.iterdir() if not is_trial(path.name)] if self.path.exists() else []
         own = interventions.resolve()
-        if {path.name for path in paths if path.resolve() not in (own, *own.parents)} <= begun:
+        paths = [path for path in self.path.iterdir() if not is_trial(path.name)] if self.path.exists() else []
+        names = {path.name for path in paths if path.resolve() not in (own, *own.parents)}
+        if names <= {LOCK, CONFIG_NAME + PARTIAL}:  # of a run that could not write even its options
             return None
-        if not is_run:
+        if not (self.path / CONFIG_NAME).is_file():
             raise InputError(
                 f"--output_dir={self.path} holds files, but no run of playbyear-dagger (no {CONFIG_NAME}): choose another."
             )
