@@ -205,7 +205,7 @@ def test_a_disk_that_is_not_mounted_holds_no_new_dataset(finished, tmp_path):
     assert not list((tmp_path / "corrections").iterdir())
 
 
-# `checkpoints/best`: the weights of the best evaluation, which are kept until a better one comes
+# `checkpoints/best`: the weights of the best evaluation; all that were evaluated are kept
 
 
 EVALUATED = (*QUICK, "--warmup_episodes=1", "--eval_every=2", "--eval.n_episodes=1")

@@ -287,10 +287,11 @@ class Loop:
         state.success = float(info["overall"]["pc_success"])
         seeds, is_trained = [cfg.seed, cfg.eval.n_episodes], state.checkpoint is not None or not cfg.new_weights
         is_best = state.best.get("seeds") != seeds or state.success >= state.best["success"]  # of equal ones the last
+        for name in (state.best.get("checkpoint"), state.checkpoint):
+            if name is not None and name not in state.milestones:
+                state.milestones.append(name)
         if is_trained and is_best:
             state.best = {"success": state.success, "checkpoint": state.checkpoint, "seeds": seeds}
-        if state.checkpoint is not None and state.checkpoint not in state.milestones:
-            state.milestones.append(state.checkpoint)
         self.report.write_evaluation(info, evaluation_s=round(time.perf_counter() - start, 3))
         self.folder.commit(state)
         self.folder.clean(state)

@@ -166,9 +166,9 @@ class RunFolder:
                 or its state is damaged or missing.
         """
         check_no_links(self.path, METRICS_NAME, ATTEMPTS, *RUN_FOLDERS)
-        own = interventions.resolve()
+        here, own = self.path.resolve(), interventions.resolve()
         paths = [path for path in self.path.iterdir() if not is_trial(path.name)] if self.path.exists() else []
-        names = {path.name for path in paths if path.resolve() not in (own, *own.parents)}
+        names = {path.name for path in paths if here / path.name not in (own, *own.parents)}
         if names <= {LOCK, CONFIG_NAME + PARTIAL}:  # of a run that could not write even its options
             return None
         if not (self.path / CONFIG_NAME).is_file():
