@@ -8,7 +8,6 @@ state names are ever removed, and nothing is written or removed through a link.
 import contextlib
 import json
 import logging
-import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -33,6 +32,7 @@ from lerobot_playbyear.datasets.files import (
     is_trial,
     new_folder,
     parse_json,
+    replace_link,
     write_atomically,
 )
 from lerobot_playbyear.hub.push import METRICS_NAME, RUN_FOLDERS, read_metrics
@@ -263,12 +263,7 @@ class RunFolder:
                 if (self.checkpoints / name).is_symlink():
                     (self.checkpoints / name).unlink()
                 continue
-            link, place = self.checkpoints / (name + PARTIAL), self.checkpoints / name
-            link.unlink(missing_ok=True)
-            link.symlink_to(checkpoint)
-            if place.is_dir() and not place.is_symlink():  # the folder was copied, and what links named with it
-                shutil.rmtree(place)
-            os.replace(link, place)
+            replace_link(self.checkpoints / name, checkpoint)
         wanted = {*state.milestones, *named.values()}
         for name in [name for name in state.made if name not in wanted]:
             shutil.rmtree(self.checkpoints / name, ignore_errors=True)  # not where it is a link
