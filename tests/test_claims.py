@@ -152,7 +152,8 @@ def listening() -> list[str]:
 
 
 def interventions() -> list[str]:
-    names = ("no_interventions", "no_interventions-no_audio", "equal_updates", "full", "redo")
+    parts = [f"no_interventions-no_{part}" for part in ("audio", "vision", "memory")]
+    names = ("no_interventions", *parts, "equal_updates", "full", "redo")
     by_name = {name: rows("interventions", GRASP, name) for name in names}
     full, redo = ([row["expert"] for row in by_name[name]] for name in ("full", "redo"))
     assert ({row["kept"] for row in full}, {row["kept"] for row in redo}) == ({100}, {50})
