@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 from support import shared
 from support.shared import run_in_process
 
+from lerobot_playbyear.datasets.files import PARTIAL
 from lerobot_playbyear.hub.push import read_metrics
 from lerobot_playbyear.scripts.commands import train
 from lerobot_playbyear.training.command_line import PRESETS, RECIPES, apply_preset, preset_options
@@ -101,6 +102,7 @@ def test_a_checkpoint_is_written_as_a_whole_in_a_copied_run_too(trained, tmp_pat
     shutil.copytree(trained, run)  # `last` is a folder in it
     (run / "metrics.jsonl").write_text('{"kind": "training", "st')  # as after a power cut
     checkpoints = run / "checkpoints"
+    (checkpoints / f"last{PARTIAL}").symlink_to("000006")  # as after a kill
     options = ("--resume=true", f"--config_path={config_of(checkpoints / '000003')}", "--save_freq=6")
     weights = checkpoints / "000006/pretrained_model/model.safetensors"
     before = weights.read_bytes()

@@ -18,7 +18,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
 
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
-from lerobot_playbyear.datasets.files import check_can_be_made, check_no_links, entries_below
+from lerobot_playbyear.datasets.files import PARTIAL, check_can_be_made, check_no_links, entries_below
 from lerobot_playbyear.datasets.reader import DatasetReader, check_dataset_files
 from lerobot_playbyear.hub.push import METRICS_NAME, RUN_FOLDERS, PushOptions, check_upload, push_policy
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
@@ -161,7 +161,10 @@ def _check_links(run: Path) -> None:
     check_no_links(run, METRICS_NAME, *RUN_FOLDERS)
     folders = [run / name for name in (CHECKPOINTS_DIR, "eval") if (run / name).is_dir()]
     there = [path.relative_to(run) for folder in folders for path in entries_below(folder)]
-    check_no_links(run, *(str(path) for path in there if path != Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK)))
+    own = [
+        Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK + ending) for ending in ("", PARTIAL)
+    ]  # PARTIAL: it was killed there
+    check_no_links(run, *(str(path) for path in there if path not in own))
 
 
 def _loss_of(
