@@ -160,8 +160,8 @@ class TaskEnv(gym.Env):
         if self._sample_rate < 8000 or self._sample_rate % hz:
             wanted = f"give a multiple of {hz} from 8000 on, such as 16000 or 48000: each step holds as many samples"
             raise OptionError("sample_rate", self._sample_rate, wanted)
-        names, known = self.microphones, tuple(ALL_MICROPHONES)
-        if sound == "waveform" and (not names or len(set(names)) < len(names) or not set(names) <= set(known)):
+        names, known = self.microphones, ALL_MICROPHONES
+        if sound == "waveform" and (not names or len(set(names)) < len(names) or any(n not in known for n in names)):
             raise OptionError("microphones", names, f"name at least one of {', '.join(known)}, each only once")
         if not 0 <= noise_level < np.inf:
             raise OptionError("noise_level", noise_level, "give 0 (silent) or more")

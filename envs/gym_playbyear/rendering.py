@@ -101,6 +101,7 @@ class PeopleView:
         self._size = size
         self._renderer: SceneRenderer | None = None  # opened when they are first asked for
         self._window: Window | None = None
+        self._drawn: tuple[bytes, np.ndarray] | None = None  # the last state and its picture
 
     def follow(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Puts everything where it is in the simulation."""
@@ -110,11 +111,15 @@ class PeopleView:
         mujoco.mj_camlight(self.model, self.data)
 
     def picture(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        """The simulation's state as a picture (size, size, 3) uint8."""
-        self.follow(model, data)
-        if self._renderer is None:
-            self._renderer = SceneRenderer(self.model, self._size, shadows=True)
-        return self._renderer.render(self.data, PEOPLE_CAMERA.name)
+        """The simulation's state as a picture (size, size, 3) uint8. What has not moved is not drawn again: LeRobot's evaluation
+        asks on when an episode is over."""
+        state = data.qpos.tobytes() + model.body_pos.tobytes() + model.body_quat.tobytes()
+        if self._drawn is None or self._drawn[0] != state:
+            self.follow(model, data)
+            if self._renderer is None:
+                self._renderer = SceneRenderer(self.model, self._size, shadows=True)
+            self._drawn = state, self._renderer.render(self.data, PEOPLE_CAMERA.name)
+        return self._drawn[1].copy()
 
     def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Shows the simulation's state in a window."""

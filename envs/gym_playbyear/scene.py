@@ -30,7 +30,7 @@ def compose(task: Task, picture_size: int, hidden_object: bool = True) -> mujoco
   <option timestep="{task.physics_dt}" integrator="implicitfast" cone="elliptic" impratio="10"/>
   <visual>
     <global offwidth="{picture_size}" offheight="{picture_size}"/>
-    <quality offsamples="0" numslices="10" numstacks="5"/>
+    <quality offsamples="0" shadowsize="0" numslices="10" numstacks="5"/>
     <headlight ambient="0.45 0.45 0.45" diffuse="0.45 0.45 0.45" specular="0 0 0"/>
     <map znear="0.02" zfar="20"/>
   </visual>

@@ -30,7 +30,7 @@ _OF_MATERIALS = {
 }
 _CAMERA_SHIFT = (-0.21, -0.33, 0.42)  # m, from where the plain view is taken: the arm is in the picture
 _FIELD = 37.0  # degrees
-_SHADOW_SIZE, _SHADOW_REACH = 1024, 2.0  # pixels of the map of shadows, and half the side of what it covers [m]
+_SHADOW_SIZE, _SHADOW_REACH = 512, 1.0  # pixels of the map of shadows, and half the side of what it covers [m]
 _FLOOR_HALF_SIZE = 4.0  # m
 _SKY = (0.93, 0.95, 0.97), (0.66, 0.72, 0.79)
 _LEG, _LEG_IN = 0.022, 0.06  # m: half a leg's thickness, and how far it stands inside the table's edge
