@@ -107,6 +107,21 @@ def test_each_episode_may_have_its_own_offset(silent, tmp_path):
         np.testing.assert_array_equal(waveform[2 * SIZE : 3 * SIZE], sound[round(offset * RATE) + SIZE :][:SIZE])
 
 
+@pytest.mark.parametrize("text", ['{"0": 1, "1": 2, "2": 3}', '"123"', "[0, 1, Infinity]", "[[0], 1, 2]"])
+def test_offsets_are_a_list_of_numbers(silent, tmp_path, text):
+    (tmp_path / "offsets.json").write_text(text)
+    with pytest.raises(InputError, match=r"is not a list of numbers|episode 2.*infinity"):
+        attach_files(silent, tmp_path / "heard", write_sounds(tmp_path / "sound"), offsets=tmp_path / "offsets.json")
+
+
+def test_the_copy_of_the_folder_one_is_in_lies_beside_it(silent, tmp_path, monkeypatch):
+    shutil.copytree(silent, tmp_path / "here")
+    monkeypatch.chdir(tmp_path / "here")
+    files = write_sounds(tmp_path / "sound")
+    target = attach_audio(AttachAudioConfig(DatasetPlace("test/silent", "."), files=files, offset=OFFSET))
+    assert target == tmp_path / "here_with_sound"
+
+
 def test_a_second_microphone_can_follow(silent, tmp_path):
     files = write_sounds(tmp_path / "sound")
     one = attach_files(silent, tmp_path / "one", files)
@@ -278,7 +293,7 @@ def test_times_in_json_may_have_any_order_of_bytes(tmp_path, encoding):
     assert read_clock(tmp_path / "times.json") == {0: 1.5, 1: 20.0}
 
 
-@pytest.mark.parametrize("text", ["0;1.754,5\n", "0;1,754,000\n", "\0\0\0", "0,1\0,5\n"])
+@pytest.mark.parametrize("text", ["0;1.754,5\n", "0;1,754,000\n", "\0\0\0", "0,1\0,5\n", "0,7,53\n", "0.0\t7.5\n"])
 def test_marks_between_thousands_and_zeros_are_no_times(tmp_path, text):
     (tmp_path / "times.csv").write_text(text)
     with pytest.raises(ClockError, match="wanted"):

@@ -28,6 +28,7 @@ from lerobot_playbyear.audio.microphone_pictures import (
     write_timecode,
 )
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.processor_playbyear import MicrophonePicturesToAudioStep
@@ -77,10 +78,11 @@ def counters_of(n: int, first: int = 8000, seed: int = 0) -> list[int]:
 
 
 def recorded(
-    root: Path, session: Session, episodes: list[list[int]], video: bool = False, by_person=None, **others
+    root: Path, session: Session, episodes: list[list[int]], video: bool = False, by_person=None, table=None, **others
 ) -> Path:
-    """A dataset of these steps, with LeRobot's own functions."""
-    features = hw_to_dataset_features({"a.pos": float, "b.pos": float, "mic": (224, 224, 3)}, "observation", video)
+    """A dataset of these steps, with LeRobot's own functions; `table` is a second microphone, which never pauses."""
+    microphones = {name: (224, 224, 3) for name in ("mic", "table") if name == "mic" or table}
+    features = hw_to_dataset_features({"a.pos": float, "b.pos": float, **microphones}, "observation", video)
     features |= hw_to_dataset_features({"a.pos": float, "b.pos": float}, "action", video)
     if by_person:
         features["intervention"] = {"dtype": "bool", "shape": (1,), "names": None}
@@ -89,6 +91,8 @@ def recorded(
         for i, counter in enumerate(counters):
             low = np.array([i, counter % 7], np.float32)
             frame = {"observation.state": low, "action": low, PICTURE: session.picture(counter), "task": "listen"}
+            if table:
+                frame["observation.images.table"] = table.picture(8000 + SIZE * i)
             if by_person:
                 frame["intervention"] = np.array([bool(by_person[i])])
             dataset.add_frame(frame)
@@ -270,9 +274,27 @@ def test_a_dataset_of_the_hub_gets_no_sound_of_this_machines_sessions_by_itself(
     (root / ".cache/huggingface").mkdir(parents=True)
     with pytest.raises(InputError, match="came from the Hub and may be a stranger's"):
         attached(root)
+    write_audio(tmp_path / "other0.wav", sound(8), RATE)
+    places = DatasetPlace("me/strange", str(root)), DatasetPlace("me/copy", str(tmp_path / "copy"))
+    attach_audio(AttachAudioConfig(*places, files=f"{tmp_path}/other{{episode}}.wav", microphone="other"))
+    with pytest.raises(InputError, match="came from the Hub and may be a stranger's"):
+        attached(tmp_path / "copy")
     shutil.rmtree(root / ".cache")
     attached(root)
     assert "0.2 to 0.9 s of" in capsys.readouterr().out
+
+
+def test_a_second_microphone_follows_and_the_pauses_of_the_first_are_kept(tmp_path):
+    session, table = (Session(tmp_path / "sessions", sound(20), number) for number in (0x11, 0x22))
+    pause = counters_of(20)
+    root = recorded(tmp_path / "heard", session, [[*pause, *counters_of(15, pause[-1] + 20000, seed=1)]], table=table)
+    one, both = DatasetPlace("me/one", str(tmp_path / "one")), DatasetPlace("me/both", str(tmp_path / "both"))
+    attach_audio(AttachAudioConfig(DatasetPlace("me/heard", str(root)), one, microphone="mic"))
+    attach_audio(AttachAudioConfig(one, both))
+    dataset = LeRobotDataset("me/both", root=tmp_path / "both")
+    assert {KEY, "observation.audio.table"} <= set(dataset.features)
+    assert np.flatnonzero(column(dataset, "is_first")).tolist() == [0, 20]
+    assert not survey(tmp_path / "both").damage
 
 
 def test_a_hand_back_begins_anew_however_short_the_pause(tmp_path):

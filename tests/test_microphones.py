@@ -4,13 +4,16 @@ import contextlib
 import gc
 import logging
 import re
+import shlex
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.utils.errors import DeviceNotConnectedError
 from sound_server import RATE, Player, SoundServer, started, why_not
@@ -20,9 +23,9 @@ from lerobot_playbyear.audio.audio_files import read_audio, write_audio
 from lerobot_playbyear.audio.control_steps import HALF
 from lerobot_playbyear.audio.microphone_pictures import SessionSound, Strip, find_session, read_strip
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
-from lerobot_playbyear.microphones.card import CardRecording
+from lerobot_playbyear.microphones.card import CardRecording, _open_cards
 from lerobot_playbyear.microphones.finding import FindMicrophonesConfig, described, find_microphones, suggested_device
-from lerobot_playbyear.microphones.microphone import MicrophoneError, PlayedMicrophone, register_source
+from lerobot_playbyear.microphones.microphone import SOURCES, MicrophoneError, PlayedMicrophone, register_source
 from lerobot_playbyear.microphones.portaudio import SoundCard, cards_called, find_card, sound_cards
 from lerobot_playbyear.microphones.session_file import SessionFile
 
@@ -391,6 +394,33 @@ def test_a_full_disk_ends_the_recording_with_its_reason(tmp_path, monkeypatch):
         assert "No space left on device" in str(until_error(cameras["mic"], 5))
 
 
+def test_a_disk_that_is_too_slow_ends_the_recording_before_silence_is_written(tmp_path):
+    written = [0]
+    path = tmp_path / "slow.wav"
+    file = SessionFile(path, 1000, lambda: written[0], lambda start, stop: np.ones(stop - start, np.int16), 10_000)
+    written[0] = 10_000  # as much as is kept
+    while path.stat().st_size < 20_000:
+        time.sleep(0.01)
+    assert not file.error
+    written[0] = 30_000
+    file.close()
+    assert "the disk was too slow" in file.error
+
+
+def test_a_card_that_is_refused_is_not_kept(monkeypatch):
+    source = partial(
+        PlayedMicrophone, "a mute card", np.zeros((RATE, 1), np.int16), 16000
+    )  # whatever rate is asked for
+    monkeypatch.setitem(SOURCES, "stubborn", lambda config, channels: source())
+    for _ in range(2):
+        with (
+            pytest.raises(MicrophoneError, match="have sample_rate 16000 and 48000"),
+            listening(mic=options(source="stubborn")),
+        ):
+            pass
+    assert not _open_cards
+
+
 def test_a_microphone_that_is_forgotten_listens_no_longer(tmp_path):
     camera = MicrophoneCamera(options(tone_hz=440.0, save_to=str(tmp_path)))
     camera.connect()
@@ -468,9 +498,12 @@ def test_the_name_that_is_suggested_holds_in_another_order_of_plugging():
 
 
 def test_the_printed_option_names_one_card_or_says_that_two_cannot_be_told_apart():
-    cards = plugged_in("USB Mic, Core Audio", "USB Mic, Core Audio", 'The "good" one')
+    cards = plugged_in("USB Mic, Core Audio", "USB Mic, Core Audio", 'The "good" one', "John's \\")
     *_, option, warning = described(cards[0], (48000,), cards)
     assert 'device: "0"' in option
     assert "may swap after a restart" in warning
     (*_, quoted) = described(cards[2], (44100,), cards)
     assert 'device: "The \\"good\\" one", sample_rate: 44100' in quoted
+    (*_, option) = described(cards[3], (44100,), cards)
+    (pasted,) = shlex.split(option)
+    assert yaml.safe_load(pasted.partition("=")[2])["mic"]["device"] == "John's \\"

@@ -432,3 +432,14 @@ def test_a_teleoperator_that_cannot_work_says_what_is_missing(config, message, m
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ExpertError, match=message):
         connect_teleoperator(config, Screenless())
+
+
+def test_an_arm_that_no_longer_answers_is_told_as_what_it_is():
+    """LeRobot's bus raises ConnectionError, which is an OSError, as are those of a full disk."""
+
+    class Unplugged(ScriptedTeleop):
+        def get_action(self):
+            raise ConnectionError("There is no status packet!")
+
+    with pytest.raises(ExpertError, match="no longer answers: There is no status packet"):
+        play({}, Unplugged(ScriptedTeleopConfig()), demonstrates=True)

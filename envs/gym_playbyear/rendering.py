@@ -111,8 +111,8 @@ class PeopleView:
         mujoco.mj_camlight(self.model, self.data)
 
     def picture(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        """The simulation's state as a picture (size, size, 3) uint8. What has not moved is not drawn again: LeRobot's evaluation
-        asks on when an episode is over."""
+        """The simulation's state as a picture (size, size, 3) uint8. What has not moved is not drawn again: an evaluation by
+        LeRobot asks on when an episode is over."""
         state = data.qpos.tobytes() + model.body_pos.tobytes() + model.body_quat.tobytes()
         if self._drawn is None or self._drawn[0] != state:
             self.follow(model, data)

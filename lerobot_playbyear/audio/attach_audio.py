@@ -6,7 +6,8 @@ files of sound that a dataset has itself. Microphones that were recorded as came
 LeRobot is imported when the dataset's files have been looked at.
 """
 
-import json
+import os
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache, partial
@@ -21,7 +22,7 @@ from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_
 from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
 from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
-from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, scratch_folder
+from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, parse_json
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.frame_rate import divides, exact_rate, nearest_sample_rate
 from lerobot_playbyear.datasets.info import check_links, nothing_in
@@ -75,7 +76,7 @@ class AttachAudioConfig:
 
     def __post_init__(self) -> None:
         if not self.output.repo_id:
-            root = self.output.root or (self.dataset.root and f"{Path(self.dataset.root)}_with_sound")
+            root = self.output.root or (self.dataset.root and f"{os.path.abspath(self.dataset.root)}_with_sound")
             self.output = DatasetPlace(f"{self.dataset.repo_id}_with_sound", root)
 
 
@@ -152,7 +153,8 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
     dataset = open_for_copy(cfg.dataset, has_own_files)
     removed: list[str] = []
     notes: Features = {}
-    with scratch_folder() as folder:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.sound-") as folder:
         scratch = Path(folder)
         if has_own_files:
             tracks = read_tracks(dataset, cfg.offset)
@@ -242,6 +244,8 @@ def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
                     f"--{option.name}={value} is for --files and one --session=FILE, not for {source}. Leave it out, or say "
                     "where the files are."
                 )
+    if cfg.session is not None and not cfg.session.exists():
+        raise InputError(f"--session={cfg.session}: nothing is there. Name the file or the folder.")
     if cfg.files is not None and "{episode" not in cfg.files:
         raise InputError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")
     for name in ("clock", "marks"):
@@ -272,7 +276,10 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     if cfg.offsets is None:
         return [offset] * n_episodes
     try:
-        values = [float(value) for value in json.loads(cfg.offsets.read_bytes())]
+        values = parse_json(cfg.offsets.read_bytes())
+        if not isinstance(values, list):
+            raise ValueError(f"it holds {type(values).__name__}")
+        values = [float(value) for value in values]
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"--offsets={cfg.offsets} is not a list of numbers in JSON: {error}") from error
     if len(values) != n_episodes:
@@ -305,7 +312,7 @@ def _read(sources: list[Source], cfg: AttachAudioConfig, dataset: DatasetReader,
                 rate = _new_rate(cfg, own_rate, fps, source.is_own)
                 first_with.setdefault(rate, episode)
                 sound.append(cut_into_frames(samples, own_rate, fps, len(rows), start_s, cfg.pad, rate, speed))
-            except (AudioFileError, ValueError) as error:
+            except (AudioFileError, ValueError, OverflowError) as error:  # --offset=inf
                 errors.append(f"{source.named(episode)}{error}")
         if len(first_with) > 1:
             each = ", ".join(f"{rate} Hz (episode {first_with[rate]})" for rate in sorted(first_with))
@@ -340,7 +347,7 @@ def _files(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], _: P
     def path_of(episode: int) -> str:
         try:
             return str(Path(pattern.format(episode=episode)))
-        except (KeyError, IndexError, ValueError) as error:
+        except (LookupError, ValueError, AttributeError, TypeError) as error:
             raise InputError(
                 f"--files={pattern} cannot be filled in: {error}. Only {{episode}} may be in it."
             ) from error

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, PutAside, raise_all
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
-from lerobot_playbyear.audio.dataset_copy import AddedColumn, Columns
+from lerobot_playbyear.audio.dataset_copy import AddedColumn, Columns, came_from_the_hub
 from lerobot_playbyear.audio.microphone_pictures import (
     SESSIONS,
     SessionSound,
@@ -33,7 +32,6 @@ from lerobot_playbyear.datasets.features import (
     Features,
     samples_per_frame,
 )
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.frame_rate import nearest_sample_rate
 from lerobot_playbyear.datasets.reader import DatasetReader
@@ -79,20 +77,22 @@ def read_camera_sound(cfg: AttachAudioConfig, dataset: DatasetReader, scratch: P
         columns, starts = _MicrophoneReader(cfg, dataset, key, scratch).read()
         added.update(columns)
         is_first = [own | other for own, other in zip(is_first, starts, strict=True)]
-    for flags, by_person in zip(is_first, _by_person(dataset), strict=True):
+    for flags, before, by_person in zip(
+        is_first, _flags(dataset, IS_FIRST), _flags(dataset, INTERVENTION), strict=True
+    ):
+        flags |= before  # LeRobot's rollout resets the policy at every hand-back, too, however short the pause
         flags[1:] |= by_person[:-1] & ~by_person[1:]
     stats = [numeric_stats({IS_FIRST: flags[:, None]}, {IS_FIRST: IS_FIRST_FEATURE})[IS_FIRST] for flags in is_first]
     added[IS_FIRST] = AddedColumn(IS_FIRST_FEATURE, stats, is_first.__getitem__)
     return added, {key: {MICROPHONE: audio_key_of(key)} for key in chosen}
 
 
-def _by_person(dataset: DatasetReader) -> list[np.ndarray]:
-    """Which frames of each episode are corrections, (n,) bool: LeRobot's rollout resets the policy at every hand-back, however
-    short the pause."""
-    feature = dataset.meta.features.get(INTERVENTION)
+def _flags(dataset: DatasetReader, key: str) -> list[np.ndarray]:
+    """A column of flags, of each episode (n,) bool; all false where the dataset has none."""
+    feature = dataset.meta.features.get(key)
     if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
         return [np.zeros(len(episode), bool) for episode in dataset.episodes]
-    return [dataset.values(INTERVENTION, episode).astype(bool) for episode in dataset.episodes]
+    return [dataset.values(key, episode).astype(bool) for episode in dataset.episodes]
 
 
 class _MicrophoneReader:
@@ -102,7 +102,7 @@ class _MicrophoneReader:
         self._dataset, self._key = dataset, key
         self._sound = PutAside([audio_key_of(key)], scratch)
         # A stranger's pictures may name a session of this machine's own, and so its voices: they get those that are named.
-        self._is_foreign = _came_from_the_hub(Path(dataset.root))
+        self._is_foreign = came_from_the_hub(Path(dataset.root))
         own = [] if self._is_foreign else [SESSIONS]
         self._folders = own if cfg.session is None else [cfg.session, *own]
         self._files: dict[int, SessionSound] = {}
@@ -152,7 +152,8 @@ class _MicrophoneReader:
             told += f"; {len(is_first) - n_read} timecodes could not be read and follow from their neighbours"
         pauses = sum(is_first[1:])
         told += f"; {pauses} pauses" if pauses else ""
-        tqdm.write(f"episode {episode}, {audio_key_of(self._key)}: {len(is_first)} frames, exact samples of {told}")
+        key = printable(audio_key_of(self._key))
+        tqdm.write(f"episode {episode}, {key}: {len(is_first)} frames, exact samples of {told}")
         return np.array(is_first)
 
     @property
@@ -260,10 +261,3 @@ def _known(frames: Iterator[_Frame | None], size: Callable[[_Frame], int]) -> It
         raise ValueError("none of its timecodes can be read: are these a microphone's pictures, in their own size?")
     for i in range(n_unknown):
         yield _Frame(last.session, last.counter + (i + 1) * size(last), was_read=False)
-
-
-def _came_from_the_hub(root: Path) -> bool:
-    """Whether a dataset's folder is one that LeRobot or the Hub's client downloaded."""
-    caches = [Path(HF_HUB_CACHE).resolve(), (HF_LEROBOT_HOME / "hub").resolve()]
-    is_in_cache = any(root.resolve().is_relative_to(cache) for cache in caches)
-    return is_in_cache or (root / ".cache" / "huggingface").exists()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from huggingface_hub.constants import HF_HUB_CACHE
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_stats
 from lerobot.utils.constants import DEFAULT_FEATURES
@@ -17,7 +18,7 @@ from tqdm import tqdm
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import Features
-from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, new_folder
+from lerobot_playbyear.datasets.files import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH, entries_below, fits, new_folder
 from lerobot_playbyear.datasets.info import STATS_PATH, read_info
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
@@ -32,7 +33,8 @@ from lerobot_playbyear.datasets.parquet import (
 from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.statistics import add_stats, stats_columns, write_stats
 
-_SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
+_SCRATCH = ("images", ".git")  # what is in these folders is not the dataset's
+_DOWNLOADED = Path(".cache/huggingface")  # is in the folder of what came from the Hub
 _DATA, _EPISODES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet"
 
 
@@ -63,7 +65,7 @@ def write_copy(
         root: The dataset, as `open_for_copy` opens it.
         target: Where; nothing is there yet.
         added: The columns, by their keys; all of the same episodes.
-        removed: Features with files of sound in whose place they come.
+        removed: Features with files of sound in whose place they come; so do features of the same names.
         notes: What the `info` of other features says more.
 
     Raises:
@@ -72,6 +74,7 @@ def write_copy(
     """
     try:
         with new_folder(target) as unfinished:
+            removed = [*removed, *(added.keys() & read_info(root)["features"].keys())]
             _write_files(root, unfinished, added, removed, notes or {})
     except ParquetDamageError as error:
         raise InputError(f"{error} Repair it first: {repair_command(root)}") from error
@@ -90,6 +93,8 @@ def _write_files(root: Path, target: Path, added: Columns, removed: Collection[s
     schema = get_hf_features_from_features(shaped).arrow_schema
     episodes = [dict(zip(added, own, strict=True)) for own in zip(*(a.stats for a in added.values()), strict=True)]
     files = [path for path in entries_below(root) if path.is_file() and path.relative_to(root).parts[0] not in _SCRATCH]
+    if came_from_the_hub(root):
+        (target / _DOWNLOADED).mkdir(parents=True)
     for path in tqdm(files, desc="Writing", unit="file"):
         name = path.relative_to(root)
         if name.parts[0] == AUDIO_FOLDER and any(key in name.parts for key in removed):
@@ -145,3 +150,10 @@ def _write_rows(source: Path, target: Path, stats: Sequence[Mapping], removed: C
     for name in more[0] if more else ():
         rows = rows.append_column(name, pa.array([own[name] for own in more]))
     write_rows(rows.replace_schema_metadata(None), target)
+
+
+def came_from_the_hub(root: Path) -> bool:
+    """Whether a dataset's folder is one that LeRobot or the Hub's client downloaded, or a copy of one."""
+    caches = [Path(HF_HUB_CACHE).resolve(), (HF_LEROBOT_HOME / "hub").resolve()]
+    is_in_cache = any(root.resolve().is_relative_to(cache) for cache in caches)
+    return is_in_cache or (root / _DOWNLOADED).exists()

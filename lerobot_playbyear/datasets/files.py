@@ -259,13 +259,6 @@ class FolderLock(contextlib.ExitStack):
             raise FolderLockedError(in_use) from error
 
 
-def scratch_folder() -> tempfile.TemporaryDirectory[str]:
-    """A folder for files of gigabytes, beside LeRobot's cache: what `tempfile` chooses by itself may be memory."""
-    cache = HF_LEROBOT_HOME.with_name("lerobot_playbyear")
-    cache.mkdir(parents=True, exist_ok=True)
-    return tempfile.TemporaryDirectory(dir=cache, prefix="scratch-")
-
-
 _trial = ".playbyear-"  # begin of the name of a folder that is made for a moment
 
 

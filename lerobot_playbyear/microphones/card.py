@@ -248,10 +248,10 @@ def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int]) -> Open
         MicrophoneError: The card cannot be opened, nothing comes from it, or it is open in another way.
     """
     with _lock:
-        card = _open_cards.get(config.card)
-        if card is None:
-            card = OpenCard(config, max(channels) + 1)
-            _open_cards[config.card] = card
+        card = _open_cards.get(config.card) or OpenCard(config, max(channels) + 1)
+        card.n_users += 1
+        _open_cards[config.card] = card
+    try:
         if card.microphone.problem:
             raise MicrophoneError(
                 f"{card.microphone.name} is gone: {card.microphone.problem}. Disconnect the others first."
@@ -266,8 +266,10 @@ def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int]) -> Open
                 f"channel={config.channel} of a microphone ({config.label}): the card is open with "
                 f"{card.microphone.channels} channels. Make all of its microphones before one is connected."
             )
-        card.n_users += 1
-        return card
+    except MicrophoneError:
+        leave_card(config, card)
+        raise
+    return card
 
 
 def leave_card(config: "MicrophoneCameraConfig", card: OpenCard) -> None:

@@ -109,7 +109,8 @@ def described(card: SoundCard, rates: tuple[int, ...], cards: list[SoundCard]) -
     yield f"  channels: {card.channels}{served}"
     yield f"  sample rates: {', '.join(map(str, rates)) or 'none that is usual'} Hz; its own is {card.sample_rate} Hz"
     device, is_lasting = suggested_device(card, cards)
-    quoted, rate = device.replace('"', '\\"'), suggested_rate(card, rates)
+    rate = suggested_rate(card, rates)
+    quoted = device.replace("\\", "\\\\").replace('"', '\\"').replace("'", "'\\''")  # for YAML, then for a shell
     yield f"  --robot.cameras='{{mic: {{type: microphone, device: \"{quoted}\", sample_rate: {rate}}}}}'"
     if not is_lasting:
         yield (

@@ -41,7 +41,8 @@ class SessionFile:
         self._rate, self._written, self._samples = rate, written, samples
         new = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
         self._file = os.fdopen(os.open(path, new, 0o600), "wb", buffering=0)
-        self._n = max(written() - n_kept, 0)  # what is older is a hole in the file, and silence
+        self._n_kept = n_kept
+        self._n = max(written() - n_kept + rate // 10, 0)  # what is older is a hole in the file, and silence
         self._stop = threading.Event()
         try:
             self._write_new()
@@ -70,6 +71,8 @@ class SessionFile:
     def _write_new(self) -> None:
         end = self._written()
         while True:
+            if self._written() - self._n > self._n_kept:
+                raise OSError("the disk was too slow, and sound is lost")
             stop = min(end, self._n + _BLOCK)
             self._write(self._samples(self._n, stop).astype("<i2").tobytes(), HEADER_BYTES + 2 * self._n)
             self._n = stop

@@ -100,7 +100,7 @@ def own_temporary_folder() -> Iterator[None]:
         raise InputError(
             f"The system's temporary folder cannot be written: {error}. Make room there, or name another: TMPDIR=..."
         ) from error
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{system}/torchinductor_{os.getuid()}")
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{system}/torchinductor_{getattr(os, 'getuid', int)()}")
     with own as folder:
         tempfile.tempdir = folder
         try:

@@ -92,11 +92,15 @@ class Controls:
 
         Raises:
             PersonLeftError: They want to end the session, or unplugged the teleoperator.
+            ExpertError: The teleoperator does not answer.
         """
         self._keys.look()
         if not self._teleop.is_connected or LEAVE in self._keys.pressed:
             raise PersonLeftError
-        self.action = self._teleop.get_action()
+        try:
+            self.action = self._teleop.get_action()
+        except OSError as error:  # of LeRobot's bus
+            raise ExpertError(f"The teleoperator no longer answers: {error}. What was saved is safe.") from error
         events = dict(self._teleop.get_teleop_events()) if hasattr(self._teleop, "get_teleop_events") else {}
         began = {event for event, is_on in events.items() if is_on and not self._events.get(event, False)}
         self._events = events
