@@ -111,7 +111,6 @@ record | --env.sample_rate=16001 | `env.sample_rate`: 16001 | a multiple of 20
 record | --env.fps=30 | `env.fps`: 30 | give 20, or leave it out
 record | --env.microphones=[] | env.microphones | at least one
 record | --env.visualization_width=100 | `env.visualization_width`: 100 | square
-record | --env.render_mode=video | `env.render_mode`: 'video' | rgb_array, human
 record | --env.room_noise_level=8 | `env.room_noise_level`: 8.0 | name a WAV file with --env.room_noise
 record | --env.sound=none --env.microphone_response=phone | env.microphone_response | no sound
 record | --env.attempts_file={full} | attempts_file | {full} | it is a folder, give a file
@@ -176,7 +175,7 @@ attach-audio | --files={sounds}/odd/{{episode:03d}}.wav | 11025 samples per seco
 attach-audio | --dataset.root={noise} | 'observation.audio.gripper' is in the dataset already
 attach-audio | --session={sounds}/day.wav | both are given. Give one
 session | -session | is for --files and one --session
-session | --session={out}/no.wav | There is no sound file | {out}/no.wav
+session | --session={out}/no.wav | --session={out}/no.wav: there is no such file or folder
 session | -clock | playbyear_clock.json. Give --clock=times.csv
 session | --clock={out}/tiems.csv | there is no {out}/tiems.csv. Give --clock=times.csv
 session | --marks=1.0 | '1.0' is not a mark; wanted seconds in the sound file = seconds on the clock
@@ -203,6 +202,9 @@ policy | dtype: half | --policy.dtype must be one of auto, float32, bfloat16, fl
 policy | action_range: 0.0 | --policy.action_range must be above 0 and at most 1000, got 0
 policy | audio_noise_files: here | audio_noise_files=here | how loud | --policy.audio_noise_db=24
 policy | audio_room_noise: true | audio_room_noise=True | how loud | --policy.audio_noise_db=24
+policy | low_dimensional_gain: .nan | --policy.low_dimensional_gain must be at least 0 (none) and finite, got nan
+policy | segment_s: 0.0 | at least one segment of --policy.segment_s (0.0)
+policy | audio_channels: [] | --policy.audio_channels must be one or more numbers from 1 on
 policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (none) and finite, got -1.0
 policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.low_dimensional_gain is 0: give 4
 policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memory_displacement_gain is 0: give 10

@@ -106,7 +106,7 @@ def test_the_reference_names_all_tasks_their_options_parts_and_limits():
         "max_parallel_tasks",
         "disable_env_checker",
     }  # by the task or by LeRobot
-    for_people = {"visualization_width", "visualization_height", "render_mode"}
+    for_people = {"visualization_width", "visualization_height"}
     options = {field.name for field in fields(PlaybyearEnvConfig)} - fixed - for_people
     parts = {field.name for kind in (Task, Prop, Limits) for field in fields(kind)}
     assert {*TASKS, *options, *parts} <= named

@@ -23,7 +23,6 @@ from gym_playbyear.task import Task, unknown_name
 
 SOUND_MODES = ("waveform", "contact_force", "none")
 _SETTLE_STEPS = 10
-_ROOM_MICROPHONE = np.array((0.6, 0.0, 1.2))  # m, world frame: for microphones that no part of the arm carries
 _PROXY_SILENT_ABOVE = 0.84  # m, world frame: as in the authors' code, whose cubes lie on the table
 _PROXY_LIFTED = 0.015  # m: above where a thing lay that lay higher than they do, such as keys in a bag
 
@@ -112,6 +111,7 @@ class TaskEnv(gym.Env):
         if sound == "waveform":
             rates = (self._sample_rate, definition.control_hz, definition.physics_dt)
             self._synthesizer = Synthesizer(self._contacts.pairs, self.microphones, *rates, noise_level)
+            self._places = {name: np.array(ALL_MICROPHONES[name].place) for name in self.microphones}
             self._room = Room(self.microphones, self._sample_rate, **room) if room else None
         spec = compose(definition, max(render_size, image_size), hidden_object)
         add_sensors(spec, self._contacts.pairs, sound == "waveform")
@@ -371,7 +371,7 @@ class TaskEnv(gym.Env):
 
     def _place_of(self, microphone: str) -> np.ndarray:
         body = self.definition.arm.links.get(microphone)
-        return _ROOM_MICROPHONE if body is None else self.data.body(body).xpos
+        return self._places[microphone] if body is None else self.data.body(body).xpos
 
     def _force_proxy(self) -> np.ndarray:
         """The paper's stand-in for sound (6,) float32 [N, Nm]: mean net contact force and torque on `force_proxy_of`, silent

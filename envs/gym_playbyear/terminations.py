@@ -67,7 +67,8 @@ class Shoved(Termination):
         prop: What must not be shoved.
         distance: How far it may move [m].
         carried_height: Its own height above which it counts as lifted [m, world].
-        squeeze: Force of the hand from which on it counts as held [N].
+        squeeze: With which both fingers, the first two parts of the hand, press on it from either side along y from which on it
+            counts as held [N]. One finger that jams it against a rail holds nothing.
     """
 
     name = "shoved"
@@ -80,17 +81,18 @@ class Shoved(Termination):
 
     def applies(self, env: Any) -> bool:
         place = env.position(self.prop)
-        is_held = env.contact_forces[f"gripper-{self.prop}"] > self.squeeze
-        self._was_carried |= bool(place[2] > self.carried_height or is_held)
+        left, right = env.hand_forces(self.prop)[:, :2, 1].T  # (T,) each
+        squeeze = (np.abs(left - right) - np.abs(left + right)) / 2  # the smaller of both where they are opposed
+        self._was_carried |= bool(place[2] > self.carried_height or squeeze.max() > self.squeeze)
         return not self._was_carried and bool(np.linalg.norm((place - self._first)[:2]) > self.distance)
 
 
 class Pressed(Termination):
-    """A protective stop: the hand came down on a thing that is not between its fingers, as arms for people stop at a push.
+    """A protective stop: the hand pressed on a thing that is not between its fingers, as arms for people stop at a push.
 
-    The side of a finger gives a push along the table, and at most `friction` times that along the finger: a squeeze, however
-    hard, and what is lifted or set down by it. What is beyond that comes from the underside of a finger, or of the hand. It
-    is judged at every physics step.
+    The side of a finger that faces the other pushes along y, and gives at most `friction` times that along other axes: a
+    squeeze, however hard, and what is lifted or set down by it. What is beyond that comes from the underside of a finger or
+    of the hand, or from a finger's edge, as when it jams the thing against a rail. It is judged at every physics step.
 
     Args:
         prop: What must not be pressed on, a loose thing.
@@ -107,10 +109,9 @@ class Pressed(Termination):
         return self.force(env) > self.limit
 
     def force(self, env: Any) -> float:
-        """Largest force of a part of the hand along its approach in the last step, beyond what its side may give [N]."""
-        forces = env.hand_forces(self.prop)  # (T, parts, 3)
-        across = np.hypot(forces[..., 0], forces[..., 1])
-        return float((np.abs(forces[..., 2]) - self.friction * across).max())
+        """Largest force of a part of the hand in the last step, beyond what a finger's side may give [N]."""
+        x, y, z = np.moveaxis(env.hand_forces(self.prop), -1, 0)  # (T, parts) each
+        return float((np.hypot(x, z) - self.friction * np.abs(y)).max())
 
 
 class Groped(Termination):

@@ -80,7 +80,6 @@ class PlaybyearEnvConfig(EnvConfig):
         task_options: The task's own options by name, such as `{cube_material: glass}` or `{contents: pens}`.
         hidden_object: False: the hand passes through the hidden object. Everything else is the same.
         visualization_width, visualization_height: Size of the picture from `render()` [pixels]. Both must be equal.
-        render_mode: `rgb_array` (for videos), or `human` for a window.
         attempts_file: File to which each episode appends a line of JSON: seed, steps, success, how it ended, and whether the
             hand acted before anything was heard (`attempts.py`).
 
@@ -107,7 +106,6 @@ class PlaybyearEnvConfig(EnvConfig):
     # For people
     visualization_width: int = 480
     visualization_height: int = 480
-    render_mode: str = "rgb_array"
     attempts_file: str | None = None
     # Filled in by __post_init__ from the fields above
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -149,7 +147,7 @@ class PlaybyearEnvConfig(EnvConfig):
             "horizon": self.episode_length,
             "hidden_object": self.hidden_object,
             "room": self._room(),
-            "render_mode": self.render_mode,
+            "render_mode": "rgb_array",
             "render_size": self.visualization_width,
             **self.task_options,
         }

@@ -19,7 +19,9 @@ from gym_playbyear.terminations import Pressed, Shoved, Success
 
 RADIUS, HALF_HEIGHT = 0.025, 0.025  # m
 TIN_CAN = ringing(TINPLATE, cup(TINPLATE, RADIUS, 0.0003, (2, 3, 4, 5)), support=30.0)
-BASE = Microphone({"table": 0.7, "link1": 1.0}, hum=3.0)  # at the arm's foot: --env.microphones='[gripper, base]'
+BASE = Microphone(
+    {"table": 0.7, "link1": 1.0}, hum=3.0, place=(-0.5, 0.0, 0.8)
+)  # at the arm's foot: --env.microphones='[gripper, base]'
 RANGE = (-0.1, 0.25)  # m: where along the wall it may stand
 SWEEP_HEIGHT, NEAR = 0.03, 0.01  # m
 TIN = Prop(
@@ -41,11 +43,11 @@ def stop_at_the_tin() -> Task:
         props=(box("wall", (0.02, 0.4, 0.3), (0.2, 0.0, 0.775), WALL_COLOUR, material="wall"), TIN),
         cameras=(FRONT_CAMERA,),
         initialize_episode=place,
-        success=Success(is_near, "tin", seconds=0.5, tolerance=0.003),
+        success=Success(is_near, "tin", seconds=1.0, tolerance=0.003),
         terminations=(Shoved("tin", distance=0.03), Pressed("tin", 5.0, FINGER_FRICTION)),
         expert=Expert,
         blind={"middle": StopInTheMiddle},
-        horizon=200,
+        horizon=80,  # longer, a hand that creeps along without stopping passes for one that stopped
         start=(0.0, -0.25, 0.9),
     )
 

@@ -245,7 +245,7 @@ def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
                     "where the files are."
                 )
     if cfg.session is not None and not cfg.session.exists():
-        raise InputError(f"--session={cfg.session}: nothing is there. Name the file or the folder.")
+        raise InputError(f"--session={cfg.session}: there is no such file or folder.")
     if cfg.files is not None and "{episode" not in cfg.files:
         raise InputError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")
     for name in ("clock", "marks"):

@@ -34,12 +34,13 @@ _SIZES = {
 }
 """From 1 to this: beyond it a configuration is damaged, or asks for all memory."""
 
-_AT_MOST = {"memory_readers": 8192, "audio_window_s": 60, "sample_rate": 1_000_000}
+_AT_MOST = {"memory_readers": 8192, "audio_window_s": 60, "sample_rate": 1_000_000, "augmentation_scale": 0.9}
 _MOST_NUMBERS = 2**16  # of a state
 _USUAL_FPS = 20
 _LARGEST = 1000  # frames per second, and range of actions
+_SHORTEST_HOP_S = 0.0005  # s: from column to column of the spectrogram
 _AT_LEAST_0 = (
-    *("audio_envelope_gain", "memory_displacement_gain", "memory_readers"),
+    *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "low_dimensional_gain"),
     *("low_dimensional_noise", "low_dimensional_offset", "auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
 )
 
@@ -336,10 +337,14 @@ class PlaybyearConfig(PreTrainedConfig):
                     f"--policy.{option}={getattr(self, option)} says nothing of how loud the noise may be: add "
                     "--policy.audio_noise_db=24 (dB above the recordings' own noise floor)."
                 )
-        if self.audio_window_s < self.segment_s or self.hop_s <= 0:
+        if not 0 < self.segment_s <= self.audio_window_s or not self.hop_s >= _SHORTEST_HOP_S:
             raise ValueError(
                 f"--policy.audio_window_s ({self.audio_window_s}) must hold at least one segment of "
-                f"--policy.segment_s ({self.segment_s}), and --policy.hop_s ({self.hop_s}) must be positive."
+                f"--policy.segment_s ({self.segment_s}), and --policy.hop_s ({self.hop_s}) be {_SHORTEST_HOP_S} or more."
+            )
+        if min(self.audio_channels, default=0) < 1:
+            raise ValueError(
+                f"--policy.audio_channels must be one or more numbers from 1 on, got {self.audio_channels}."
             )
         if not (self.use_vision or self.use_audio or self.low_dimensional_keys or not self.input_features):
             raise ValueError(

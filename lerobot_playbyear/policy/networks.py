@@ -299,7 +299,7 @@ class MemoryHead(nn.Module):
     def __init__(self, config: PlaybyearConfig, n_actions: int, n_felt: int):
         super().__init__()
         self.memory_steps, self.action_range = config.memory_steps, config.action_range
-        self.displacement_gain = config.memory_displacement_gain / config.low_dimensional_gain
+        self.displacement_gain = config.memory_displacement_gain / (config.low_dimensional_gain or 1.0)
         self.n_fused = config.embedding_size
         n_compared = n_felt if self.displacement_gain else 0
         self.lstm = nn.LSTM(self.n_fused + n_compared, config.embedding_size, batch_first=True)

@@ -1,11 +1,13 @@
-"""Deaf scripts for a hidden cube: tapping and nudging.
+"""Deaf scripts for a hidden cube: tapping, nudging, jamming and creeping.
 
 Tapping: a hand that is lowered stops higher where it lands on the cube than beside it, and the arm's own position says so.
 A script keeps a belief about the cube's place, taps where a tap tells most, and closes where the cube should be between the
 fingers. If it holds nothing it goes on, as long as the attempt lasts.
 
-Nudging feels nothing: a cube may be moved some way before the attempt has failed, so the hand sweeps just that far and grasps
-where a cube that it met must then be; then the next stretch.
+The others feel nothing. Nudging: a cube may be moved some way before the attempt has failed, so the hand sweeps just that far
+and grasps where a cube that it met must then be; then the next stretch. Jamming: a cube that counts as held may be pushed
+anywhere, so the hand presses it against what lies across the line, pushes it to the range's end and grasps there. Creeping: a
+hand that never stops has stopped everywhere, if it is slow.
 """
 
 from collections.abc import Generator
@@ -293,8 +295,50 @@ class NudgingScript(DeafScript):
         yield from self._wait(1)
 
 
+_JAM_HEIGHT, _JAM_SPACING = 0.033, 0.05  # m above the table; between two pushes across the line
+_JAM_FROM, _JAM_TO = -0.06, -0.015  # m beside the line: from where to where
+
+
+class JammingScript(DeafScript):
+    """Pushes across the line everywhere, sweeps all of it, and grasps at its end."""
+
+    def _plan(self) -> Actions:
+        lower, upper = self.hidden_range
+        n_pushes = int(np.ceil((upper - lower) / _JAM_SPACING))
+        for y in lower + (np.arange(n_pushes) + 0.5) * (upper - lower) / n_pushes:
+            for x, step, settle in ((_JAM_FROM, 0.04, 1), (_JAM_TO, 0.02, 1), (_JAM_FROM, 0.04, 0)):
+                yield from self._go(self._on_line(y, _JAM_HEIGHT) + np.array([x, 0, 0]), step, settle=settle)
+        yield from self._rise(TRAVEL_HEIGHT)
+        start, end = lower - self.reach - 0.02, upper - self.reach + 0.005
+        for y, height, step in ((start, TRAVEL_HEIGHT, 0.04), (start, GRASP_HEIGHT, 0.02), (end, GRASP_HEIGHT, 0.012)):
+            yield from self._go(self._on_line(y, height), step)
+        found = float(self.hand[1]) + self.reach + _FURTHER
+        yield from self._go(self._sent - np.array([0, _BACK_OFF, 0]))
+        yield from self._rise(TRAVEL_HEIGHT)
+        for height in (TRAVEL_HEIGHT, GRASP_HEIGHT):
+            yield from self._go(self._on_line(found, height), 0.02, settle=2)
+        yield from self._grasp()
+
+
+_CREEP_STEP, _CREEP_HEIGHT = 0.0011, 0.03  # m
+
+
+class CreepingScript(DeafScript):
+    """Moves on so slowly that it is beside what it comes to for a second, as far towards the range's end as time allows."""
+
+    def _plan(self) -> Actions:
+        lower, upper = self.hidden_range
+        end = upper - self.reach
+        start = max(end - _CREEP_STEP * self.steps_left, lower - self.reach - _RUN_UP)
+        for height in (TRAVEL_HEIGHT, _CREEP_HEIGHT):
+            yield from self._go(self._on_line(start, height), 0.05, settle=0)
+        yield from self._go(self._on_line(end, _CREEP_HEIGHT), _CREEP_STEP, settle=self.facts.horizon)
+
+
 SCRIPTS: dict[str, ScriptMaker] = {
     **{name: partial(TappingScript, tap=tap) for name, tap in TAPS.items()},
     "nudge": NudgingScript,
+    "jam": JammingScript,
+    "creep": CreepingScript,
 }
 """For all tasks whose camera shows a `hidden_range`, by name."""

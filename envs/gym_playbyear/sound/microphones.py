@@ -30,12 +30,14 @@ class Microphone:
         hum: Gain of the arm's motors.
         drive: Gain of the hand's own motor.
         air: Gain of what comes through the air.
+        place: Where it is [m, world frame], if it is named for no part of the arm.
     """
 
     structure: Mapping[str, float] = field(default_factory=dict)
     hum: float = 1.0
     drive: float = 1.0
     air: float = 1.0
+    place: tuple[float, float, float] = (0.6, 0.0, 1.2)
 
 
 def _robot(**nearer: float) -> dict[str, float]:
@@ -49,7 +51,9 @@ MICROPHONES: dict[str, Microphone] = {
     # One on each finger; a finger's carriage keeps part of its sound from the hand and from the other finger.
     "left_finger": Microphone(_robot(left_finger=1.0, right_finger=0.2, hand=0.4, gripper=0.5), hum=0.5, drive=0.7),
     "right_finger": Microphone(_robot(right_finger=1.0, left_finger=0.2, hand=0.4, gripper=0.5), hum=0.5, drive=0.7),
-    "table": Microphone({"table": 1.0, "wall": 0.7, "tray": 0.7, "bin": 0.7}, hum=0.3, drive=0.05),
+    "table": Microphone(
+        {"table": 1.0, "wall": 0.7, "tray": 0.7, "bin": 0.7}, hum=0.3, drive=0.05, place=(0.35, 0.0, 0.8)
+    ),
     # Touches nothing, and hears the air as the others do: the room's background and its noise are as loud as at the gripper.
     "room": Microphone(hum=0.2, drive=0.03),
 }

@@ -33,7 +33,7 @@ _CUBE_YAW = np.pi / 12  # rad, either way: a turned cube does not fit between th
 _CUBE_FRICTION = 0.4  # sliding: a cube that blocked the arm would give the contact away
 _CARRIED_HEIGHT = TABLE_TOP + CUBE_HALF_SIZE + 0.015  # m: the cube's centre is this high only when it was picked up
 _HOLD_SECONDS, _STILL = 0.5, 0.015  # s, m: so long a cube stays where it is wanted, and moves no further meanwhile
-_SQUEEZE = 20.0  # N from which on the cube counts as held, and not shoved
+_SQUEEZE = 10.0  # N of both fingers from which on the cube counts as held, and not shoved
 _MAX_PRESS, _CLOSINGS = 5.0, 3  # N; the how-manieth closing on nothing ends the attempt
 _RAIL_GAP, _RAIL_HEIGHT, _RAIL_THICKNESS = 0.06, 0.02, 0.01  # m
 
@@ -83,8 +83,8 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
     random; `reset(options={"cube_position": (x, y), "cube_yaw": yaw})` sets them.
 
     ## Episode Termination
-    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 2.2 cm along the table;
-    "pressed", when the hand came down on the cube with more than 5 N, which stops an arm for people (a squeeze between the
+    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was moved more than 2.2 cm before both fingers held it;
+    "pressed", when the hand pressed on the cube with more than 5 N, which stops an arm for people (a squeeze between the
     fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
     `horizon` steps (250): enough for a second search after a failed grasp.
 
@@ -142,8 +142,8 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     them.
 
     ## Episode Termination
-    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 2.2 cm along the table;
-    "pressed", when the hand came down on the cube with more than 5 N, which stops an arm for people (a squeeze between the
+    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was moved more than 2.2 cm before both fingers held it;
+    "pressed", when the hand pressed on the cube with more than 5 N, which stops an arm for people (a squeeze between the
     fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
     `horizon` steps (400): enough for a second search after a failed grasp.
 
