@@ -147,6 +147,36 @@ def test_an_episode_that_was_published_in_vain_is_there_after_closing(tmp_path, 
     assert_recorded(root, range(2))
 
 
+def test_a_journal_that_cannot_be_looked_at_now_is_not_taken_for_none(tmp_path, monkeypatch):
+    """The episode that it stands for is complete: it is in the dataset once the disk answers again."""
+    root = tmp_path / "dataset"
+    target = writer(root)
+    write_episode(target, 0)
+    with monkeypatch.context() as patch:
+        fail_once(patch, os, "replace", 1, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+        with pytest.raises(DatasetWriteError, match="complete on disk"):
+            write_episode(target, 1)
+    target._lock.close()
+    before = everything(root)
+
+    def failing(real: Callable[..., Any]) -> Callable[..., Any]:
+        def fails(path: Any = ".", **options: Any) -> Any:
+            if Path(path).name in ("images", ".journal.json"):
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            return real(path, **options)
+
+        return fails
+
+    with monkeypatch.context() as patch:
+        for name in ("listdir", "lstat"):
+            patch.setattr(os, name, failing(getattr(os, name)))
+        with pytest.raises(DatasetWriteError, match="Input/output error"):
+            writer(root)
+    assert everything(root) == before
+    writer(root).close()
+    assert_recorded(root, range(2))
+
+
 def test_a_drive_that_is_gone_is_not_begun_anew(tmp_path):
     """What is mounted there instead is an empty folder; when the drive is back, all goes on."""
     root = tmp_path / "dataset"

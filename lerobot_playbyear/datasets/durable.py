@@ -29,7 +29,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot_playbyear.datasets.episode_files import stage_episode
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
 from lerobot_playbyear.datasets.features import Features, check_features, check_frame, differences, is_depth
-from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, list_files
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, is_listed, list_files
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.info import check_parts, nothing_in
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, finish_journal, lock_dataset, publish, remove_staged
@@ -255,7 +255,7 @@ class DurableWriter:
         self._info = info
 
     def _info_on_disk(self) -> DatasetInfo:
-        is_new = self.num_episodes == 0 and not (self.root / INFO_PATH).exists()
+        is_new = self.num_episodes == 0 and not is_listed(self.root, INFO_PATH)
         return deepcopy(self._info) if is_new else load_info(self.root)
 
     def _forget_episode(self) -> None:
@@ -293,7 +293,7 @@ def check_root(root: Path, *, resume: bool) -> None:
     """
     if root.exists() and not root.is_dir():
         raise DatasetWriteError(f"Cannot write a dataset to {root}: it is a file.")
-    if has_dataset(root) or (root / JOURNAL).is_file():
+    if has_dataset(root):
         if not resume:
             raise FileExistsError(f"{root} already holds a dataset. Append with --resume=true, or choose another root.")
     elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
@@ -310,7 +310,7 @@ def has_dataset(root: Path) -> bool:
         os.listdir(root)
     except FileNotFoundError:
         return False
-    return any(list_files(root, name) for name in (INFO_PATH, "data/chunk-*/file-*", "meta/episodes/*/*"))
+    return any(list_files(root, name) for name in (INFO_PATH, str(JOURNAL), "data/chunk-*/file-*", "meta/episodes/*/*"))
 
 
 def check_undamaged(root: Path) -> None:

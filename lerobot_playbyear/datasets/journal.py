@@ -8,11 +8,20 @@ moved stays inside the dataset, and no folder is followed that is a link.
 import contextlib
 import os
 import shutil
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, flush_all, write_atomically
+from lerobot_playbyear.datasets.files import (
+    INFO_PATH,
+    FolderLock,
+    entries_below,
+    flush,
+    flush_all,
+    is_listed,
+    write_atomically,
+)
 from lerobot_playbyear.datasets.remedies import repair_command
 
 SCRATCH = Path("images")
@@ -52,12 +61,13 @@ def finish_journal(root: Path) -> None:
 
     Raises:
         JournalError: It, or what is to be moved, is none of ours; nothing was moved.
+        OSError: It cannot be looked at now, which is not to say that there is none; or something cannot be moved.
     """
     journal = root / JOURNAL
-    if not os.path.lexists(journal):
+    if not is_listed(root, JOURNAL):
         return
     names = _staged_files(root)
-    if journal.is_symlink() or not journal.is_file():
+    if not stat.S_ISREG(journal.lstat().st_mode):
         remedy = f"If nothing is being recorded there, delete it and run `{repair_command(root)}`"
         raise _error(journal, "is not an ordinary file", remedy)
     for name in names:
@@ -132,7 +142,7 @@ def _staged_files(root: Path) -> list[Path]:
     check_scratch(root)
     staging = root / STAGING
     names: list[Path] = []
-    for entry in entries_below(staging) if staging.is_dir() else ():
+    for entry in entries_below(staging) if is_listed(root, STAGING) else ():
         name = entry.relative_to(staging)
         for path in (entry, root / name):
             if path.is_symlink() and (path == entry or entry.is_dir()):
