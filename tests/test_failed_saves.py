@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,18 @@ def test_an_episode_that_was_published_in_vain_is_there_after_closing(tmp_path, 
     assert_recorded(root, range(2))
 
 
+def hide_journal(patch: pytest.MonkeyPatch, *calls: str) -> None:
+    """Lets these calls of `os` fail wherever they would tell whether there is a journal."""
+
+    def failing(real: Callable[..., Any], path: Any = ".", **options: Any) -> Any:
+        if Path(path).name in ("images", ".journal.json"):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return real(path, **options)
+
+    for call in calls:
+        patch.setattr(os, call, partial(failing, getattr(os, call)))
+
+
 def test_a_journal_that_cannot_be_looked_at_now_is_not_taken_for_none(tmp_path, monkeypatch):
     """The episode that it stands for is complete: it is in the dataset once the disk answers again."""
     root = tmp_path / "dataset"
@@ -158,22 +171,27 @@ def test_a_journal_that_cannot_be_looked_at_now_is_not_taken_for_none(tmp_path, 
             write_episode(target, 1)
     target._lock.close()
     before = everything(root)
-
-    def failing(real: Callable[..., Any]) -> Callable[..., Any]:
-        def fails(path: Any = ".", **options: Any) -> Any:
-            if Path(path).name in ("images", ".journal.json"):
-                raise OSError(errno.EIO, os.strerror(errno.EIO))
-            return real(path, **options)
-
-        return fails
-
     with monkeypatch.context() as patch:
-        for name in ("listdir", "lstat"):
-            patch.setattr(os, name, failing(getattr(os, name)))
+        hide_journal(patch, "listdir", "lstat")
         with pytest.raises(DatasetWriteError, match="Input/output error"):
             writer(root)
     assert everything(root) == before
     writer(root).close()
+    assert_recorded(root, range(2))
+
+
+def test_while_the_journal_cannot_be_looked_at_a_save_is_asked_for_again_and_nothing_is_given_up(tmp_path, monkeypatch):
+    root = tmp_path / "dataset"
+    with writer(root) as target:
+        write_episode(target, 0)
+        add_episode(target, 1)
+        with monkeypatch.context() as patch:
+            hide_journal(patch, "listdir", "lstat", "stat")
+            with pytest.raises(DatasetWriteError, match="Episode 1 could not be written"):
+                target.save_episode()
+            with pytest.raises(DatasetWriteError, match="call save_episode"):
+                target.discard_episode()
+        assert target.save_episode() == 1
     assert_recorded(root, range(2))
 
 

@@ -180,11 +180,14 @@ class DurableWriter:
         """Forgets the episode in progress.
 
         Raises:
-            DatasetWriteError: It is complete on disk already, and only has to be moved to its place.
+            DatasetWriteError: It is complete on disk already, and only has to be moved to its place; or may be.
         """
-        if (self.root / JOURNAL).exists():
-            raise DatasetWriteError(f"Episode {self.num_episodes} is complete on disk already: call save_episode.")
-        self._forget_episode()
+        with contextlib.suppress(OSError):
+            if not (self._is_complete and is_listed(self.root, JOURNAL)):
+                return self._forget_episode()
+        raise DatasetWriteError(
+            f"Episode {self.num_episodes} is complete on disk already, or {self.root} cannot be read: call save_episode."
+        )
 
     def close(self) -> None:
         """Drops an episode in progress. Safe to call twice."""
@@ -268,7 +271,7 @@ class DurableWriter:
         with contextlib.suppress(OSError):
             if shutil.disk_usage(self.root).free < _LOW_DISK_BYTES:
                 reason = f"the disk is full ({reason})"
-        if (self.root / JOURNAL).exists():
+        if os.path.lexists(self.root / JOURNAL):  # it never raises
             return (
                 f"Episode {index} is complete on disk, but could not be moved to its place in {self.root}: {reason}. "
                 "It is there as soon as save_episode is called again, or the dataset is opened with --resume=true, and the "
