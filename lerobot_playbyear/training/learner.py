@@ -36,7 +36,7 @@ from lerobot_playbyear.compat import (
 )
 from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.features import is_depth, number_names
-from lerobot_playbyear.datasets.files import INFO_PATH, new_folder, parse_json, replace_link
+from lerobot_playbyear.datasets.files import INFO_PATH, flush_all, new_folder, parse_json, replace_link
 from lerobot_playbyear.datasets.remedies import without_feature
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
@@ -130,9 +130,14 @@ class Learner:
         """Write a checkpoint where lerobot-train would, as a whole or not at all, and return its folder."""
         folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
         folder.parent.mkdir(parents=True, exist_ok=True)
+        aside = folder.with_name(f".{folder.name}.old")
         with new_folder(folder) as partial:
             self.write_checkpoint(partial, cfg)
-            shutil.rmtree(folder, ignore_errors=True)  # of an attempt that went further than what this one began with
+            flush_all(partial)
+            shutil.rmtree(aside, ignore_errors=True)
+            if folder.is_dir():  # of an attempt that went further than what this one began with
+                folder.rename(aside)
+        shutil.rmtree(aside, ignore_errors=True)
         replace_link(folder.with_name(LAST_CHECKPOINT_LINK), folder.name)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
             push_checkpoint(folder, cfg.policy.repo_id, cfg.policy.private)
