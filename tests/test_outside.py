@@ -116,6 +116,17 @@ def test_training_writes_through_no_link(recorded, trained, tmp_path, secret, na
     assert f"{Path(name).name}' is a link to" in str(said)
 
 
+def test_what_goes_up_after_a_training_is_of_its_run(trained, tmp_path, here):
+    run = Path(shutil.copytree(trained.parents[2], tmp_path / "run", symlinks=True))
+    shutil.copytree(trained.parent, tmp_path / "elsewhere")
+    (run / "checkpoints/last").unlink()
+    (run / "checkpoints/last").symlink_to(tmp_path / "elsewhere")
+    resumed = ("--resume=true", f"--config_path={run / 'checkpoints/000002/pretrained_model/train_config.json'}")
+    pushed = (f"--output_dir={run}", "--policy.push_to_hub=true", "--policy.repo_id=me/stranger")
+    assert "its last checkpoint is a link to" in str(run_in_process(train, *resumed, *pushed))
+    assert not here.arrivals
+
+
 def test_dagger_removes_only_checkpoints_of_its_own(tmp_path):
     dagger(tmp_path, *QUICK, *FINISHED, "--num_episodes=2")
     first = state(tmp_path)["checkpoint"]

@@ -86,9 +86,8 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         print_results(cfg, report.success, report.acted_early)
         if cfg.policy.push_to_hub:
             # The last checkpoint is on disk, and stays there.
-            folder = (Path(str(cfg.output_dir)) / "checkpoints" / "last") if cfg.save_checkpoint else learner.save(cfg)
-            options = PushOptions(cfg.policy.private)
-            print(f"On the Hub: {push_policy(folder / 'pretrained_model', str(cfg.policy.repo_id), options)}")
+            folder = str(cfg.output_dir) if cfg.save_checkpoint else learner.save(cfg)
+            print(f"On the Hub: {push_policy(folder, str(cfg.policy.repo_id), PushOptions(cfg.policy.private))}")
     accelerator.wait_for_everyone()  # gloo may hang if a group ends while a sum of tensors has just been made
     accelerator.end_training()
     return Path(str(cfg.output_dir))
