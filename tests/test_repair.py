@@ -30,11 +30,15 @@ from recording_factory import (
 from support.recording import ENCODER, edit_column, edit_info, everything, write
 from support.shared import run_in_process
 
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import episode_files
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.journal import lock_dataset
+from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
+from lerobot_playbyear.hub.push import push_dataset
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.repair.repair import RepairReport, repair_dataset
 from lerobot_playbyear.scripts.commands import repair as repair_command
@@ -338,6 +342,29 @@ def test_pictures_in_files_are_read_in_the_folder_alone(copy):
                 repair_dataset(root)
     rows = pq.read_table(repair_dataset(root).target / EPISODES)
     assert np.allclose(np.ravel(rows.column(f"stats/{CAMERA}/max")[0].as_py()) * 255, [9, 8, 7])
+
+
+def test_pictures_where_lerobot_writes_them_come_along_and_those_of_an_unsaved_episode_do_not(copy, tmp_path, here):
+    root, audio = copy("one file"), tmp_path / "{episode}.wav"
+    (path,) = files(root / "data")
+    rows = range(pq.read_metadata(path).num_rows)
+    names = [f"images/{CAMERA}/episode-000000/frame-{row:06d}.png" for row in rows]
+    edit_column(path, CAMERA, lambda _: [{"bytes": None, "path": f"./{name}"} for name in names])
+    (root / names[0]).parent.mkdir(parents=True)
+    for name in (*names, left := f"images/{CAMERA}/frame-000000.png"):
+        Image.new("RGB", (16, 16), (9, 8, 7)).save(root / name)
+    for episode in range(N_EPISODES):
+        write_audio(Path(str(audio).format(episode=episode)), np.zeros(8000, np.int16), 8000)
+    places = DatasetPlace("a/b", str(root)), DatasetPlace("a/c", str(tmp_path / "with sound"))
+    attach_audio(AttachAudioConfig(*places, files=str(audio), microphone="new"))
+    push_dataset("me/pictures", root)
+    (root / EPISODES).write_bytes(b"lost")
+    for target in (tmp_path / "with sound", repair_dataset(root).target):
+        dataset = SurveyedDataset.open("a/b", target)
+        assert (next(dataset.pictures(CAMERA, dataset.episodes[-1]))[0, 0] == (9, 8, 7)).all()
+        assert not (target / left).exists()
+    there = here.dataset("me/pictures").files()
+    assert {name for name in there if name.startswith("images/")} == set(names)
 
 
 # Where the copy is written

@@ -17,6 +17,7 @@ from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, EPISODES_DIR, INFO_PATH, entries_below, fits
 from lerobot_playbyear.datasets.info import STATS_PATH
 from lerobot_playbyear.datasets.parquet import write_rows, write_tables
+from lerobot_playbyear.datasets.pictures import is_unsaved, named_pictures
 from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.statistics import (
     Stats,
@@ -65,17 +66,19 @@ def write_copy(survey: Survey, target: Path) -> None:
 
 def _copy_rest(survey: Survey, target: Path) -> None:
     """Films, a card, notes, files of other tools: all but the frames, the tables and what an unsaved episode left."""
+    features, whole = survey.info["features"], (episode.frames for episode in survey.whole)
+    named = named_pictures(survey.root, {frames.file for frames in whole if frames}, features)
     for path in entries_below(survey.root):
         name = path.relative_to(survey.root)
-        if path.is_file() and not _is_scratch(name, survey.info["features"]) and not fits(name, *_REMADE):
+        if path.is_file() and not _is_scratch(name, features, named) and not fits(name, *_REMADE):
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(path, target / name)  # no link: LeRobot may write into a film that is there
 
 
-def _is_scratch(name: Path, features: Collection[str]) -> bool:
+def _is_scratch(name: Path, features: Collection[str], named: Collection[str]) -> bool:
     """Whether a file is what was only needed while an episode was written."""
-    folder, inside = name.parts[0], name.parts[1:2]
-    return folder == "images" and bool(inside) and (inside[0] in features or inside[0].startswith("."))
+    inside = name.parts[1:2]
+    return is_unsaved(name, named) and bool(inside) and (inside[0] in features or inside[0].startswith("."))
 
 
 class _Kept(NamedTuple):
