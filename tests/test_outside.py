@@ -572,6 +572,20 @@ def test_a_small_table_of_many_tasks_takes_no_memory_that_is_not_there(noise, tm
             read("a/b", root)
 
 
+@pytest.mark.parametrize("is_list", [False, True])
+def test_a_long_text_in_many_rows_takes_no_memory_that_is_not_there(noise, tmp_path, monkeypatch, is_list):
+    """Once in a file of a few kilobytes, and in every row once it is read."""
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(1500, np.int32)), pa.array(["x" * 2**20]))
+    column = pa.ListArray.from_arrays(range(1501), texts) if is_list else texts
+    options = {"store_schema": False, "dictionary_pagesize_limit": 2**28, "write_statistics": False}
+    pq.write_table(pa.table({"task": column}), root / "meta/tasks.parquet", compression="zstd", **options)
+    assert (root / "meta/tasks.parquet").stat().st_size < 1e4
+    monkeypatch.setattr("lerobot_playbyear.datasets.parquet.available_memory", lambda: 2**30)
+    with pytest.raises(MemoryError, match=r"holds texts in one piece, which take 1\.5 GiB"):
+        check_dataset_files("a/b", root)
+
+
 def test_memory_that_runs_out_while_the_tasks_are_read_is_no_damage(noise, monkeypatch):
     def fail(_: Path) -> None:
         raise pa.ArrowMemoryError("malloc of size 4194304 failed")

@@ -8,12 +8,13 @@ and every page carries a checksum, so that a flipped bit is found instead of hea
 import contextlib
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.errors import first_line
@@ -57,12 +58,13 @@ def parsing(path: Path) -> Iterator[None]:
         raise ParquetDamageError(first_line(error)) from error
 
 
-def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.ParquetFile:
+def open_checked(path: Path, footer: pq.FileMetaData | None = None, coded: Sequence[str] = ()) -> pq.ParquetFile:
     """Opens a file for reading with its pages' checksums verified, where it has them.
 
     Args:
         path: The file.
         footer: What is taken for its footer; None: its own.
+        coded: The columns of texts that stay dictionaries.
 
     Raises:
         ParquetDamageError: It is not a complete parquet file.
@@ -74,7 +76,12 @@ def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.Parque
                 if file.read(4) != b"PAR1":
                     raise ParquetDamageError("it does not begin as a parquet file does")
         return pq.ParquetFile(
-            path, metadata=footer, page_checksum_verification=True, pre_buffer=False, buffer_size=_BUFFER_BYTES
+            path,
+            metadata=footer,
+            read_dictionary=list(coded),
+            page_checksum_verification=True,
+            pre_buffer=False,
+            buffer_size=_BUFFER_BYTES,
         )
 
 
@@ -91,12 +98,23 @@ def check_room(path: Path, footer: pq.FileMetaData, group: int | None = None) ->
     """
     groups = map(footer.row_group, range(footer.num_row_groups) if group is None else [group])
     n_values = sum(own.column(i).num_values for own in groups for i in range(own.num_columns))
-    wanted = n_values * (_OBJECT_BYTES if group is None else _COLUMN_BYTES)
+    _check_free(path, f"{n_values:,} values", n_values * (_OBJECT_BYTES if group is None else _COLUMN_BYTES))
+
+
+def _check_free(path: Path, what: str, wanted: int) -> None:
     if wanted > PIECE_BYTES and 2 * wanted > (free := available_memory()):
         raise MemoryError(
-            f"'{path}' holds {n_values:,} values in one piece, which take {wanted / 2**30:.1f} GiB of memory, and "
+            f"'{path}' holds {what} in one piece, which take {wanted / 2**30:.1f} GiB of memory, and "
             f"{free / 2**30:.1f} GiB are free. Use a machine with more, or ask who made the dataset."
         )
+
+
+def _n_bytes(texts: pa.Array) -> int:
+    """What texts take that are coded as dictionaries, or lists and structures of them."""
+    if pa.types.is_dictionary(texts.type):
+        return pc.sum(pc.binary_length(texts.dictionary).take(texts.indices)).as_py() or 0
+    parts = texts.flatten() if pa.types.is_nested(texts.type) else []
+    return sum(map(_n_bytes, parts if isinstance(parts, list) else [parts]))
 
 
 class DataFile:
@@ -191,6 +209,11 @@ def read_table(path: Path) -> pa.Table:
     """
     with open_checked(path) as file, parsing(path):
         check_room(path, file.metadata)
+        leaves = map(file.schema.column, range(len(file.schema)))
+        texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
+        with open_checked(path, file.metadata, texts) as coded:
+            chunks = [chunk for column in coded.read(texts, use_threads=False).columns for chunk in column.chunks]
+        _check_free(path, "texts", sum(map(_n_bytes, chunks)))
         table = file.read(use_threads=False)
         table.validate(full=True)
     return table
