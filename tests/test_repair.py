@@ -329,6 +329,30 @@ def test_no_episode_gets_the_pictures_of_another(copy):
     assert not differences(load(report.target), {0: 0}, RICH_FEATURES)
 
 
+def test_data_files_that_lerobot_reads_in_another_order_are_damage(copy):
+    root = copy("ours")
+    renamed = {path: path.with_name(f"file-{4 * n + 6}.parquet") for n, path in enumerate(files(root / "data"))}
+    assert sorted(renamed.values()) != [*renamed.values()]  # 10 comes before 6
+    for path, new in renamed.items():
+        path.rename(new)
+    change_info(root, data_path="data/chunk-{chunk_index:03d}/file-{file_index}.parquet")
+    edit_column(root / EPISODES, "data/file_index", lambda numbers: [4 * n + 6 for n in numbers])
+    assert "not in the order of their frames" in str(survey(root, thorough=False))
+    repaired(root, RICH_FEATURES)
+
+
+def test_episodes_that_take_turns_in_two_data_files_are_put_in_order(copy):
+    root = copy("one file")
+    (path,) = files(root / "data")
+    table = pq.read_table(path)
+    is_odd = np.array(table.column("episode_index")) % 2 == 1
+    for number, own in enumerate((~is_odd, is_odd)):
+        pq.write_table(table.filter(pa.array(own)), path.with_name(f"file-00{number}.parquet"))
+    edit_column(root / EPISODES, "data/file_index", lambda _: [n % 2 for n in range(N_EPISODES)])
+    assert "not in the order of their frames" in str(survey(root, thorough=False))
+    repaired(root, FEATURES)
+
+
 def test_pictures_in_files_are_read_in_the_folder_alone(copy):
     root = copy("one file")
     (path,) = files(root / "data")

@@ -457,6 +457,9 @@ def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], found: Se
         counted = f"{INFO_PATH} counts {info['total_episodes']} episodes of {info['total_frames']} frames in all"
         yield _wrong("rows", f"{counted}; there are {len(episodes)} of {n_frames}")
     used = {(each.frames.file.path, each.frames.start) for each in episodes if each.frames}
+    firsts = [each.first_index for each in found if (each.file.path, each.start) in used]
+    if firsts != sorted(firsts):
+        yield _wrong("rows", "the data files are not in the order of their frames, in which LeRobot reads them")
     if is_whole and (others := [each for each in found if (each.file.path, each.start) not in used]):
         names = sorted({each.file.path.relative_to(root).as_posix() for each in others})
         n_others = sum(each.length for each in others)

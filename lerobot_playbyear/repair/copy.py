@@ -1,8 +1,8 @@
 """The repaired copy of a dataset: every episode that a survey calls whole; what is wrong around it is made again."""
 
 import shutil
-from collections import defaultdict
 from collections.abc import Collection, Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -106,12 +106,13 @@ class _Kept(NamedTuple):
 def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
     """Writes the frames, file by file. Returns the episodes' rows."""
     dataset, first_index = SurveyedDataset(survey.root.name, survey), 0
-    by_file: dict[Path, list[_Kept]] = defaultdict(list)
+    every: list[_Kept] = []
     for number, episode in enumerate(survey.whole):
         assert episode.frames is not None
-        by_file[episode.frames.file.path].append(_Kept(episode, episode.frames, number, first_index))
+        every.append(_Kept(episode, episode.frames, number, first_index))
         first_index += episode.frames.length
-    for place, kept in enumerate(by_file.values()):
+    # The order of the files is that of the frames, whatever it was.
+    for place, kept in enumerate(list(own) for _, own in groupby(every, lambda one: one.frames.file.path)):
         chunk, number = divmod(place, survey.info["chunks_size"])
         name = target / DEFAULT_DATA_PATH.format(chunk_index=chunk, file_index=number)
         write_tables(name, (one.table() for one in kept), kept[0].frames.file.schema)
