@@ -81,7 +81,7 @@ def row_stats(row: Mapping[str, Any]) -> Stats:
     """The statistics in an episode's row of `meta/episodes`, without those that are missing."""
     stats: Stats = {}
     for column, value in row.items():
-        if column.startswith("stats/") and value is not None:
+        if column.startswith("stats/") and column.count("/") > 1 and value is not None:
             key, name = column.removeprefix("stats/").rsplit("/", 1)
             stats.setdefault(key, {})[name] = np.atleast_1d(np.array(value))
     return stats

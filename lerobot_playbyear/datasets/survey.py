@@ -218,7 +218,7 @@ def _schema(root: Path, info: Info) -> pa.Schema:
     features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in in_rows.items()}
     try:
         return get_hf_features_from_features(features).arrow_schema
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise DatasetDamagedError(f"{root / INFO_PATH}: LeRobot knows no such feature: {error}. Correct it.") from error
 
 
@@ -253,7 +253,8 @@ def _difference(found: pa.Schema, wanted: pa.Schema) -> str | None:
         return f"its columns are not the dataset's features: {names}"
     for column in wanted:
         own, kind = found.field(column.name).type, column.type
-        if not are_alike(own, kind):
+        is_whole = column.name in INDEX_COLUMNS and pa.types.is_integer(kind)
+        if not are_alike(own, kind) or (is_whole and not pa.types.is_integer(own)):
             return f"its column '{column.name}' is {own}; wanted {kind}"
     return None
 
@@ -409,7 +410,7 @@ def _contradiction(root: Path, info: Info, episode: Episode, frames: Frames) -> 
         return "its tasks are missing"
     names: dict[str, set[str]] = defaultdict(set)
     for column, value in row.items():
-        if column.startswith("stats/") and value is not None:
+        if column.startswith("stats/") and column.count("/") > 1 and value is not None:
             key, name = column.removeprefix("stats/").rsplit("/", 1)
             names[key].add(name)
             if not are_numbers(value):

@@ -47,7 +47,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         HubError: After it, if the Hub does not take the policy.
     """
     init_logging()
-    with errors_of_input(FileNotFoundError, MemoryError):
+    with errors_of_input(OSError, MemoryError):
         _check(cfg)
         assert isinstance(cfg.policy, PlaybyearConfig)
         accelerator = make_accelerator(cfg.policy)
