@@ -40,6 +40,7 @@ from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 from lerobot_playbyear.hub.push import push_dataset
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
+from lerobot_playbyear.repair import footers
 from lerobot_playbyear.repair.repair import RepairReport, repair_dataset
 from lerobot_playbyear.scripts.commands import repair as repair_command
 
@@ -389,6 +390,16 @@ def test_pictures_where_lerobot_writes_them_come_along_and_those_of_an_unsaved_e
         assert not (target / left).exists()
     there = here.dataset("me/pictures").files()
     assert {name for name in there if name.startswith("images/")} == set(names)
+
+
+def test_a_file_of_many_small_pages_takes_no_time(tmp_path, monkeypatch):
+    """What does not fit together is not tried with every number of rows that there could be."""
+    path, tried, real = tmp_path / "file.parquet", [], footers._columns
+    pq.write_table(pa.table({"a": range(3000)}), path, data_page_size=1, write_batch_size=1, use_dictionary=False)
+    path.write_bytes(path.read_bytes()[:-8])
+    monkeypatch.setattr(footers, "_columns", lambda *args: tried.append(args) or real(*args))
+    assert footers.rescue(path, pa.schema({"a": pa.int64(), "b": pa.list_(pa.int64(), 2**20)})) is None
+    assert len(tried) == 1000
 
 
 # Where the copy is written
