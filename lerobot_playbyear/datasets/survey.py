@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, naming
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
@@ -146,7 +146,7 @@ class Survey:
             return f"{self.root}: {len(self.episodes)} episodes, nothing wrong."
         verdict = "nothing wrong, but" if self.is_undamaged else "it is damaged:"
         lines = [f"{self.root}: {len(self.whole)} whole episodes; {verdict}"]
-        return "\n  - ".join([*lines, *map(str, self.findings)])
+        return "\n  - ".join([*lines, *(printable(each, kept="") for each in self.findings)])
 
 
 def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None, like: Path | None = None) -> Survey:
