@@ -58,8 +58,8 @@ class DurableWriter:
     The episode in progress is in memory. A save that fails keeps it: make room, and call `save_episode` again. An
     episode that the memory could not hold while it is saved is refused frame by frame; what is there can be saved.
 
-    A dataset with any damage is refused, and nothing in it is touched: to repair it may cost episodes, and is for
-    `playbyear-repair`.
+    A dataset in which a quick look, without pictures and sound, finds damage is refused, and nothing in it is touched: to
+    repair it may cost episodes, and is for `playbyear-repair`.
 
     Args:
         repo_id: Name of the dataset, `user/name`.

@@ -98,7 +98,11 @@ def lock_dataset(root: Path) -> FolderLock:
         OSError: It cannot be written.
     """
     check_scratch(root)
-    return FolderLock(root / LOCK, f"Another process is writing to {root}, or uploading it: wait until it has ended.")
+    new = [folder for folder in (root, *root.absolute().parents) if not folder.exists()]
+    lock = FolderLock(root / LOCK, f"Another process is writing to {root}, or uploading it: wait until it has ended.")
+    for folder in new:  # else a power cut could take them, with all episodes
+        flush(folder.parent)
+    return lock
 
 
 @contextlib.contextmanager
