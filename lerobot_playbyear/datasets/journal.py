@@ -12,16 +12,9 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from lerobot_playbyear.datasets import files
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import (
-    INFO_PATH,
-    FolderLock,
-    entries_below,
-    flush,
-    flush_all,
-    is_listed,
-    write_atomically,
-)
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, flush, is_listed
 from lerobot_playbyear.datasets.remedies import repair_command
 
 SCRATCH = Path("images")
@@ -49,9 +42,9 @@ def publish(root: Path) -> None:
         JournalError: A file's place is not inside the dataset.
     """
     _staged_files(root)  # raises where one of them leads elsewhere
-    flush_all(root / STAGING)
+    files.flush_all(root / STAGING)
     flush(root / SCRATCH)
-    write_atomically(root / JOURNAL, "")
+    files.write_atomically(root / JOURNAL, "")
     flush(root)
     finish_journal(root)
 
@@ -146,7 +139,7 @@ def _staged_files(root: Path) -> list[Path]:
     check_scratch(root)
     staging = root / STAGING
     names: list[Path] = []
-    for entry in entries_below(staging) if is_listed(root, STAGING) else ():
+    for entry in files.entries_below(staging) if is_listed(root, STAGING) else ():
         name = entry.relative_to(staging)
         for path in (entry, root / name):
             if path.is_symlink() and (path == entry or entry.is_dir()):

@@ -28,7 +28,7 @@ class ParquetDamageError(ValueError):
 PIECE_BYTES = 2**26
 """Of the rows that are in memory together, about: more is read and written in parts."""
 
-_BUFFER_BYTES = 2**20
+_READING = {"page_checksum_verification": True, "pre_buffer": False, "buffer_size": 2**20}
 _COLUMN_BYTES, _OBJECT_BYTES = 4, 20  # of a number, in a column and as Python has it, about
 _IMPOSSIBLE_BYTES = 2**40  # more memory than any part of a file takes
 _PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
@@ -75,14 +75,7 @@ def open_checked(path: Path, footer: pq.FileMetaData | None = None, coded: Seque
             with path.open("rb") as file:
                 if file.read(4) != b"PAR1":
                     raise ParquetDamageError("it does not begin as a parquet file does")
-        return pq.ParquetFile(
-            path,
-            metadata=footer,
-            read_dictionary=list(coded),
-            page_checksum_verification=True,
-            pre_buffer=False,
-            buffer_size=_BUFFER_BYTES,
-        )
+        return pq.ParquetFile(path, metadata=footer, read_dictionary=list(coded), **_READING)
 
 
 def check_room(path: Path, footer: pq.FileMetaData, group: int | None = None) -> None:
@@ -273,9 +266,7 @@ def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> N
 def write_rows(rows: pa.Table, path: Path) -> None:
     """Writes a table of episodes. Its footer carries nothing that a reader could do without: it is most of the file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(
-        rows, path, compression="snappy", write_page_checksum=True, write_statistics=False, store_schema=False
-    )
+    pq.write_table(rows, path, write_page_checksum=True, write_statistics=False, store_schema=False)
 
 
 def writer_options(schema: pa.Schema) -> dict:

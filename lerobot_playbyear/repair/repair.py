@@ -73,13 +73,11 @@ class RepairReport:
         if moved:
             more = " ..." if len(moved) > _MOST_MOVES else ""
             lines.append(f"Renumbered: {', '.join(moved[:_MOST_MOVES])}{more}.")
-        lines.append(
-            f"A copy with {len(self.kept)} whole episodes is in {self.target}; {self.survey.root} is as it was."
-        )
+        root = self.survey.root
+        lines.append(f"A copy with {len(self.kept)} whole episodes is in {self.target}; {root} is as it was.")
         if self.left:
             lines.append(f"What is left to be done in the copy: {'. '.join(each.remedy for each in self.left)}.")
-        old, new = shlex.quote(str(self.survey.root)), shlex.quote(str(self.target))
-        aside = shlex.quote(f"{self.survey.root}_damaged")
+        old, aside, new = (shlex.quote(str(each)) for each in (root, f"{root}_damaged", self.target))
         lines.append(f"To put it in the dataset's place: mv {old} {aside} && mv {new} {old}")
         return "\n".join(lines)
 

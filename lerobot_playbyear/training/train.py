@@ -160,9 +160,8 @@ def _check_links(run: Path) -> None:
     check_no_links(run, METRICS_NAME, *RUN_FOLDERS)
     folders = [run / name for name in (CHECKPOINTS_DIR, "eval") if (run / name).is_dir()]
     there = [path.relative_to(run) for folder in folders for path in entries_below(folder)]
-    own = [
-        Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK + ending) for ending in ("", PARTIAL)
-    ]  # PARTIAL: it was killed there
+    # PARTIAL: it was killed there.
+    own = [Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK + ending) for ending in ("", PARTIAL)]
     check_no_links(run, *(str(path) for path in there if path not in own))
 
 
