@@ -224,6 +224,18 @@ def test_files_are_on_the_disk_before_anything_refers_to_them(tmp_path, monkeypa
             assert ("sync", path.parent) in events[at:]
 
 
+def test_folders_above_a_new_dataset_are_on_the_disk(tmp_path, monkeypatch):
+    synchronised, real = set(), os.fsync
+
+    def fsync(descriptor: int) -> None:
+        synchronised.add(Path(os.readlink(f"/proc/self/fd/{descriptor}")))
+        real(descriptor)
+
+    monkeypatch.setattr(journal.os, "fsync", fsync)
+    write(tmp_path / "user/dataset", [0])
+    assert {tmp_path, tmp_path / "user", tmp_path / "user/dataset"} <= synchronised
+
+
 def record_and_kill(root: Path, episodes: int, share: float) -> int:
     """Has a child record, and kills it.
 

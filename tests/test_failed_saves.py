@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,12 @@ from support.recording import add_episode, assert_recorded, edit_info, everythin
 
 from lerobot_playbyear.datasets import durable, episode_files, files
 from lerobot_playbyear.datasets.durable import DatasetWriteError, has_dataset
-from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.survey import DatasetDamagedError
 from lerobot_playbyear.episodes.frames import save_or_ask
 from lerobot_playbyear.inspection import SurveyedDataset, check_numbers
-from lerobot_playbyear.repair.repair import repair_dataset
+from lerobot_playbyear.repair.repair import RepairConfig, repair, repair_dataset
 from lerobot_playbyear.training import EpisodeStore
 
 TWO_FILMS = {**RICH_FEATURES, FILM + "2": RICH_FEATURES[FILM]}
@@ -144,6 +145,58 @@ def test_an_episode_that_was_published_in_vain_is_there_after_closing(tmp_path, 
             with pytest.raises(DatasetWriteError, match="is complete on disk already"):
                 target.discard_episode()
         assert target.num_episodes == load(root).num_episodes == 1
+    assert_recorded(root, range(2))
+
+
+def published_in_vain(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leaves two episodes, of which the second is complete and not in its place."""
+    target = writer(root)
+    write_episode(target, 0)
+    with monkeypatch.context() as patch:
+        fail_once(patch, os, "replace", 1, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+        with pytest.raises(DatasetWriteError, match="complete on disk"):
+            write_episode(target, 1)
+    target._lock.close()
+
+
+def hide_journal(patch: pytest.MonkeyPatch, *calls: str) -> None:
+    """Lets these calls of `os` fail wherever they would tell whether there is a journal."""
+
+    def failing(real: Callable[..., Any], path: Any = ".", **options: Any) -> Any:
+        if Path(path).name in ("images", ".journal.json"):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return real(path, **options)
+
+    for call in calls:
+        patch.setattr(os, call, partial(failing, getattr(os, call)))
+
+
+def test_a_journal_that_cannot_be_looked_at_now_is_not_taken_for_none(tmp_path, monkeypatch):
+    """The episode that it stands for is complete: it is in the dataset once the disk answers again."""
+    root = tmp_path / "dataset"
+    published_in_vain(root, monkeypatch)
+    before = everything(root)
+    with monkeypatch.context() as patch:
+        hide_journal(patch, "listdir", "lstat")
+        with pytest.raises(DatasetWriteError, match="Input/output error"):
+            writer(root)
+    assert everything(root) == before
+    writer(root).close()
+    assert_recorded(root, range(2))
+
+
+def test_while_the_journal_cannot_be_looked_at_a_save_is_asked_for_again_and_nothing_is_given_up(tmp_path, monkeypatch):
+    root = tmp_path / "dataset"
+    with writer(root) as target:
+        write_episode(target, 0)
+        add_episode(target, 1)
+        with monkeypatch.context() as patch:
+            hide_journal(patch, "listdir", "lstat", "stat")
+            with pytest.raises(DatasetWriteError, match="Episode 1 could not be written"):
+                target.save_episode()
+            with pytest.raises(DatasetWriteError, match="call save_episode"):
+                target.discard_episode()
+        assert target.save_episode() == 1
     assert_recorded(root, range(2))
 
 
@@ -341,3 +394,17 @@ def test_a_read_only_folder_gives_one_clear_error(root):
     with as_nobody(root, 0o555), pytest.raises(DatasetWriteError, match=f"Cannot write to {root}: Permission denied"):
         writer(root)
     assert_recorded(root, range(N_EPISODES))
+
+
+def test_an_episode_that_waits_to_be_moved_is_not_called_lost(tmp_path, monkeypatch):
+    """Neither where nothing can be written nor by a dry run."""
+    root = tmp_path / "dataset"
+    published_in_vain(root, monkeypatch)
+    before = everything(root)
+    with pytest.raises(InputError, match=r"is complete, and still has to be moved .*playbyear-repair --root="):
+        repair(RepairConfig(root, dry_run=True))
+    with as_nobody(root, 0o555), pytest.raises(InputError, match="Make the folder writable"):
+        repair_dataset(root)
+    assert everything(root) == before
+    assert repair_dataset(root).survey.is_undamaged
+    assert_recorded(root, range(2))

@@ -39,6 +39,7 @@ from lerobot_playbyear.hub.push import HubError, push_dataset
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.repair.repair import RepairConfig, repair
 from lerobot_playbyear.training import EpisodeStore
 
 FILM = "observation.images.film"
@@ -368,6 +369,14 @@ def assert_harmless(card: str, head: int = 0) -> None:
     rest = re.sub(r"^```.*?^```$", "", card, flags=re.DOTALL | re.MULTILINE)  # blocks of code
     rest = re.sub(r"(`+)(?!`).*?(?<!`)\1(?!`)", "", rest)  # and code in a line
     assert not re.search(r"(?<!\\)(<img src=x|<b>|\]\(http://evil|://evil|!\[p)", rest)
+
+
+def test_a_name_forges_no_line_of_a_report(root, capsys):
+    edit_info(root, lambda info: info["features"].update({"a\n  - all is well": info["features"]["action"]}))
+    (line,) = (line for line in str(survey(root)).splitlines() if "all is well" in line)
+    assert "columns are not the dataset's features: a\\n  - all is well" in line
+    looked_at = repair(RepairConfig(root, dry_run=True))
+    assert len(capsys.readouterr().out.splitlines()) == 1 + len(looked_at.survey.findings)
 
 
 def test_the_card_of_a_dataset_shows_names_as_they_are(root):

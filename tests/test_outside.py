@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from dagger_factory import FINISHED, QUICK, command, dagger, state
-from dataset_factory import CAMERA, make_dataset
+from dataset_factory import CAMERA, MICROPHONE, make_dataset
 from support.recording import edit_column, edit_info
 from support.shared import ENV, TINY, run_in_process
 
@@ -24,7 +24,7 @@ from lerobot_playbyear.datasets.checkpoint_steps import RUN_PROGRAMS, check_step
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import FolderLockedError, new_file, new_folder, write_atomically
 from lerobot_playbyear.datasets.pictures import video_pictures
-from lerobot_playbyear.datasets.reader import SurveyedDataset, check_dataset_files
+from lerobot_playbyear.datasets.reader import DatasetReader, SurveyedDataset, check_dataset_files
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.datasets.video_files import picture_times
 from lerobot_playbyear.hub.push import PushOptions, push_policy
@@ -32,6 +32,7 @@ from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetCo
 from lerobot_playbyear.repair.repair import RepairConfig, repair
 from lerobot_playbyear.scripts.commands import dagger as dagger_command
 from lerobot_playbyear.scripts.commands import train, video
+from lerobot_playbyear.training import EpisodeStore
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -114,6 +115,17 @@ def test_training_writes_through_no_link(recorded, trained, tmp_path, secret, na
     config.write_text(json.dumps({**saved, "output_dir": str(run)}))
     said = run_in_process(train, "--resume=true", f"--config_path={config}", "--steps=4")
     assert f"{Path(name).name}' is a link to" in str(said)
+
+
+def test_what_goes_up_after_a_training_is_of_its_run(trained, tmp_path, here):
+    run = Path(shutil.copytree(trained.parents[2], tmp_path / "run", symlinks=True))
+    shutil.copytree(trained.parent, tmp_path / "elsewhere")
+    (run / "checkpoints/last").unlink()
+    (run / "checkpoints/last").symlink_to(tmp_path / "elsewhere")
+    resumed = ("--resume=true", f"--config_path={run / 'checkpoints/000002/pretrained_model/train_config.json'}")
+    pushed = (f"--output_dir={run}", "--policy.push_to_hub=true", "--policy.repo_id=me/stranger")
+    assert "its last checkpoint is a link to" in str(run_in_process(train, *resumed, *pushed))
+    assert not here.arrivals
 
 
 def test_dagger_removes_only_checkpoints_of_its_own(tmp_path):
@@ -364,6 +376,84 @@ def test_what_a_dataset_cannot_say_of_a_camera_is_named(noise, tmp_path, name, v
         survey(root)
 
 
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        *(("timestamp", {"dtype": "int64"}), ("index", {"dtype": "string"}), ("task_index", {"dtype": "float32"})),
+        *(("frame_index", {"shape": [2]}), ("episode_index", {"dtype": None})),
+    ],
+)
+def test_what_numbers_the_frames_is_one_number_in_each(noise, tmp_path, name, changes):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    edit_info(root, lambda info: info["features"][name].update(changes))
+    with pytest.raises(InputError, match=f"the feature '{name}' is missing, or not one"):
+        survey(root)
+
+
+def test_lists_longer_than_there_can_be_are_refused(noise, tmp_path):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    edit_info(root, lambda info: info["features"]["action"].update(shape=[2**31]))
+    with pytest.raises(InputError, match="LeRobot knows no such feature"):
+        survey(root)
+
+
+@pytest.mark.parametrize("name", ["index", "task_index"])
+def test_numbers_of_frames_that_are_not_whole_are_refused(noise, tmp_path, name):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("data/*/*.parquet")
+    edit_column(path, name, lambda values: [float("nan"), *values[1:]])
+    assert f"its column '{name}' is double; wanted int64" in str(survey(root))
+
+
+def test_columns_that_only_look_like_statistics_are_left_alone(noise, tmp_path):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("meta/episodes/*/*.parquet")
+    table = pq.read_table(path)
+    pq.write_table(table.append_column("stats/x", pa.array(["x"] * len(table))), path)
+    assert survey(root).is_undamaged
+    (root / "meta/stats.json").unlink()
+    repair(RepairConfig(root))
+    assert survey(tmp_path / "noise_repaired").is_undamaged
+
+
+@pytest.mark.parametrize("key", ["observation.state", "action", MICROPHONE])
+@pytest.mark.parametrize("kind", [pa.large_string(), pa.binary(), pa.time64("us"), pa.list_(pa.float32())])
+def test_columns_without_numbers_are_not_reckoned_with(noise, tmp_path, key, kind):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    value: dict[str, tuple[object, list[int]]] = {
+        "binary": (b"x", [1]),
+        "time64[us]": (5, [1]),
+        "large_string": ("x", [1]),
+    }
+    one, shape = value.get(str(kind), ([], [0]))
+    dtype = str(kind) if shape == [1] else "float32"
+    edit_info(root, lambda info: info["features"][key].update(dtype=dtype, shape=shape))
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path).replace_schema_metadata({})
+    column = pa.array([one] * len(table), kind)
+    pq.write_table(table.set_column(table.column_names.index(key), key, column), path)
+    findings = inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
+    assert ([each.feature for each in findings if each.check == "columns"] == [key]) is (key == MICROPHONE)
+
+
+@pytest.mark.parametrize("number", [-1, 7])
+def test_frames_of_a_task_without_a_text_are_refused_before_they_are_learned_from(noise, tmp_path, number):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("data/*/*.parquet")
+    edit_column(path, "task_index", lambda values: [number, *values[1:]])
+    with pytest.raises(InputError, match=f"are of task {number}, which has no text"):
+        EpisodeStore.from_dataset(DatasetReader("a/b", root), device="cpu", keys=["action"])
+
+
+def test_a_data_file_that_may_not_be_read_is_one_error_of_training(noise, tmp_path, monkeypatch):
+    def refuse(path: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("lerobot_playbyear.datasets.survey.DataFile", refuse)
+    options = ("--dataset.repo_id=a/b", f"--dataset.root={noise}", f"--output_dir={tmp_path / 'out'}")
+    assert "Permission denied" in str(run_in_process(train, *TINY, *options))
+
+
 @pytest.mark.parametrize("name", ["index", "timestamp", "task_index"])
 def test_texts_in_place_of_numbers_are_refused(noise, tmp_path, name):
     root = Path(shutil.copytree(noise, tmp_path / "noise"))
@@ -559,6 +649,20 @@ def test_a_small_table_of_many_tasks_takes_no_memory_that_is_not_there(noise, tm
     for read in (check_dataset_files, lambda _, root: survey(root)):
         with pytest.raises(MemoryError, match="values in one piece"):
             read("a/b", root)
+
+
+@pytest.mark.parametrize("is_list", [False, True])
+def test_a_long_text_in_many_rows_takes_no_memory_that_is_not_there(noise, tmp_path, monkeypatch, is_list):
+    """Once in a file of a few kilobytes, and in every row once it is read."""
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(1500, np.int32)), pa.array(["x" * 2**20]))
+    column = pa.ListArray.from_arrays(range(1501), texts) if is_list else texts
+    options = {"store_schema": False, "dictionary_pagesize_limit": 2**28, "write_statistics": False}
+    pq.write_table(pa.table({"task": column}), root / "meta/tasks.parquet", compression="zstd", **options)
+    assert (root / "meta/tasks.parquet").stat().st_size < 1e4
+    monkeypatch.setattr("lerobot_playbyear.datasets.parquet.available_memory", lambda: 2**30)
+    with pytest.raises(MemoryError, match=r"holds texts in one piece, which take 1\.5 GiB"):
+        check_dataset_files("a/b", root)
 
 
 def test_memory_that_runs_out_while_the_tasks_are_read_is_no_damage(noise, monkeypatch):

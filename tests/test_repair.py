@@ -30,12 +30,17 @@ from recording_factory import (
 from support.recording import ENCODER, edit_column, edit_info, everything, write
 from support.shared import run_in_process
 
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import episode_files
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.journal import lock_dataset
+from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
+from lerobot_playbyear.hub.push import push_dataset
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
+from lerobot_playbyear.repair import footers
 from lerobot_playbyear.repair.repair import RepairReport, repair_dataset
 from lerobot_playbyear.scripts.commands import repair as repair_command
 
@@ -325,6 +330,30 @@ def test_no_episode_gets_the_pictures_of_another(copy):
     assert not differences(load(report.target), {0: 0}, RICH_FEATURES)
 
 
+def test_data_files_that_lerobot_reads_in_another_order_are_damage(copy):
+    root = copy("ours")
+    renamed = {path: path.with_name(f"file-{4 * n + 6}.parquet") for n, path in enumerate(files(root / "data"))}
+    assert sorted(renamed.values()) != [*renamed.values()]  # 10 comes before 6
+    for path, new in renamed.items():
+        path.rename(new)
+    change_info(root, data_path="data/chunk-{chunk_index:03d}/file-{file_index}.parquet")
+    edit_column(root / EPISODES, "data/file_index", lambda numbers: [4 * n + 6 for n in numbers])
+    assert "not in the order of their frames" in str(survey(root, thorough=False))
+    repaired(root, RICH_FEATURES)
+
+
+def test_episodes_that_take_turns_in_two_data_files_are_put_in_order(copy):
+    root = copy("one file")
+    (path,) = files(root / "data")
+    table = pq.read_table(path)
+    is_odd = np.array(table.column("episode_index")) % 2 == 1
+    for number, own in enumerate((~is_odd, is_odd)):
+        pq.write_table(table.filter(pa.array(own)), path.with_name(f"file-00{number}.parquet"))
+    edit_column(root / EPISODES, "data/file_index", lambda _: [n % 2 for n in range(N_EPISODES)])
+    assert "not in the order of their frames" in str(survey(root, thorough=False))
+    repaired(root, FEATURES)
+
+
 def test_pictures_in_files_are_read_in_the_folder_alone(copy):
     root = copy("one file")
     (path,) = files(root / "data")
@@ -338,6 +367,39 @@ def test_pictures_in_files_are_read_in_the_folder_alone(copy):
                 repair_dataset(root)
     rows = pq.read_table(repair_dataset(root).target / EPISODES)
     assert np.allclose(np.ravel(rows.column(f"stats/{CAMERA}/max")[0].as_py()) * 255, [9, 8, 7])
+
+
+def test_pictures_where_lerobot_writes_them_come_along_and_those_of_an_unsaved_episode_do_not(copy, tmp_path, here):
+    root, audio = copy("one file"), tmp_path / "{episode}.wav"
+    (path,) = files(root / "data")
+    rows = range(pq.read_metadata(path).num_rows)
+    names = [f"images/{CAMERA}/episode-000000/frame-{row:06d}.png" for row in rows]
+    edit_column(path, CAMERA, lambda _: [{"bytes": None, "path": f"./{name}"} for name in names])
+    (root / names[0]).parent.mkdir(parents=True)
+    for name in (*names, left := f"images/{CAMERA}/frame-000000.png"):
+        Image.new("RGB", (16, 16), (9, 8, 7)).save(root / name)
+    for episode in range(N_EPISODES):
+        write_audio(Path(str(audio).format(episode=episode)), np.zeros(8000, np.int16), 8000)
+    places = DatasetPlace("a/b", str(root)), DatasetPlace("a/c", str(tmp_path / "with sound"))
+    attach_audio(AttachAudioConfig(*places, files=str(audio), microphone="new"))
+    push_dataset("me/pictures", root)
+    (root / EPISODES).write_bytes(b"lost")
+    for target in (tmp_path / "with sound", repair_dataset(root).target):
+        dataset = SurveyedDataset.open("a/b", target)
+        assert (next(dataset.pictures(CAMERA, dataset.episodes[-1]))[0, 0] == (9, 8, 7)).all()
+        assert not (target / left).exists()
+    there = here.dataset("me/pictures").files()
+    assert {name for name in there if name.startswith("images/")} == set(names)
+
+
+def test_a_file_of_many_small_pages_takes_no_time(tmp_path, monkeypatch):
+    """What does not fit together is not tried with every number of rows that there could be."""
+    path, tried, real = tmp_path / "file.parquet", [], footers._columns
+    pq.write_table(pa.table({"a": range(3000)}), path, data_page_size=1, write_batch_size=1, use_dictionary=False)
+    path.write_bytes(path.read_bytes()[:-8])
+    monkeypatch.setattr(footers, "_columns", lambda *args: tried.append(args) or real(*args))
+    assert footers.rescue(path, pa.schema({"a": pa.int64(), "b": pa.list_(pa.int64(), 2**20)})) is None
+    assert len(tried) == 1000
 
 
 # Where the copy is written

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -107,15 +108,17 @@ def test_a_checkpoint_is_written_as_a_whole_in_a_copied_run_too(trained, tmp_pat
     weights = checkpoints / "000006/pretrained_model/model.safetensors"
     before = weights.read_bytes()
 
-    def fail(_: object, folder: Path, cfg: object) -> None:
-        (folder / "half").touch()
+    def fail(_: object, folder: Path | None = None, cfg: object = None) -> None:
+        if folder is not None:
+            (folder / "half").touch()
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Learner, "write_checkpoint", fail)
-    with pytest.raises(OSError, match="No space left"):
-        run_in_process(train, *options, "--steps=6", f"--output_dir={run}")
-    assert weights.read_bytes() == before
-    monkeypatch.undo()
+    for owner, call in ((Learner, "write_checkpoint"), (os, "fsync")):
+        monkeypatch.setattr(owner, call, fail)
+        with pytest.raises(OSError, match="No space left"):
+            run_in_process(train, *options, "--steps=6", f"--output_dir={run}")
+        assert weights.read_bytes() == before
+        monkeypatch.undo()
     run_in_process(train, *options, "--steps=6", f"--output_dir={run}")
     assert (checkpoints / "last").readlink() == Path("000006")
     assert step_of(checkpoints / "last") == 6

@@ -18,7 +18,15 @@ from tqdm import tqdm
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import Features
-from lerobot_playbyear.datasets.files import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH, entries_below, fits, new_folder
+from lerobot_playbyear.datasets.files import (
+    EPISODES_DIR,
+    HF_LEROBOT_HOME,
+    INFO_PATH,
+    entries_below,
+    fits,
+    list_files,
+    new_folder,
+)
 from lerobot_playbyear.datasets.info import STATS_PATH, read_info
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
@@ -30,10 +38,11 @@ from lerobot_playbyear.datasets.parquet import (
     write_rows,
     write_tables,
 )
+from lerobot_playbyear.datasets.pictures import is_unsaved, named_pictures
 from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.statistics import add_stats, stats_columns, write_stats
 
-_SCRATCH = ("images", ".git")  # what is in these folders is not the dataset's
+_SCRATCH = (".cache", ".git")  # what is in these folders is not the dataset's
 _DOWNLOADED = Path(".cache/huggingface")  # is in the folder of what came from the Hub
 _DATA, _EPISODES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet"
 
@@ -92,10 +101,12 @@ def _write_files(root: Path, target: Path, added: Columns, removed: Collection[s
     shaped = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in info["features"].items()}
     schema = get_hf_features_from_features(shaped).arrow_schema
     episodes = [dict(zip(added, own, strict=True)) for own in zip(*(a.stats for a in added.values()), strict=True)]
-    files = [path for path in entries_below(root) if path.is_file() and path.relative_to(root).parts[0] not in _SCRATCH]
+    named = named_pictures(root, map(DataFile, list_files(root, _DATA)), features)
+    names = [path.relative_to(root) for path in entries_below(root) if path.is_file()]
+    paths = [root / name for name in names if name.parts[0] not in _SCRATCH and not is_unsaved(name, named)]
     if came_from_the_hub(root):
         (target / _DOWNLOADED).mkdir(parents=True)
-    for path in tqdm(files, desc="Writing", unit="file"):
+    for path in tqdm(paths, desc="Writing", unit="file"):
         name = path.relative_to(root)
         if name.parts[0] == AUDIO_FOLDER and any(key in name.parts for key in removed):
             continue

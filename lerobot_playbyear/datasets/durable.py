@@ -29,7 +29,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot_playbyear.datasets.episode_files import stage_episode
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
 from lerobot_playbyear.datasets.features import Features, check_features, check_frame, differences, is_depth
-from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, list_files
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, is_listed, list_files
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.info import check_parts, nothing_in
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, finish_journal, lock_dataset, publish, remove_staged
@@ -58,8 +58,8 @@ class DurableWriter:
     The episode in progress is in memory. A save that fails keeps it: make room, and call `save_episode` again. An
     episode that the memory could not hold while it is saved is refused frame by frame; what is there can be saved.
 
-    A dataset with any damage is refused, and nothing in it is touched: to repair it may cost episodes, and is for
-    `playbyear-repair`.
+    A dataset in which a quick look, without pictures and sound, finds damage is refused, and nothing in it is touched: to
+    repair it may cost episodes, and is for `playbyear-repair`.
 
     Args:
         repo_id: Name of the dataset, `user/name`.
@@ -180,11 +180,14 @@ class DurableWriter:
         """Forgets the episode in progress.
 
         Raises:
-            DatasetWriteError: It is complete on disk already, and only has to be moved to its place.
+            DatasetWriteError: It is complete on disk already, and only has to be moved to its place; or may be.
         """
-        if (self.root / JOURNAL).exists():
-            raise DatasetWriteError(f"Episode {self.num_episodes} is complete on disk already: call save_episode.")
-        self._forget_episode()
+        with contextlib.suppress(OSError):
+            if not (self._is_complete and is_listed(self.root, JOURNAL)):
+                return self._forget_episode()
+        raise DatasetWriteError(
+            f"Episode {self.num_episodes} is complete on disk already, or {self.root} cannot be read: call save_episode."
+        )
 
     def close(self) -> None:
         """Drops an episode in progress. Safe to call twice."""
@@ -255,7 +258,7 @@ class DurableWriter:
         self._info = info
 
     def _info_on_disk(self) -> DatasetInfo:
-        is_new = self.num_episodes == 0 and not (self.root / INFO_PATH).exists()
+        is_new = self.num_episodes == 0 and not is_listed(self.root, INFO_PATH)
         return deepcopy(self._info) if is_new else load_info(self.root)
 
     def _forget_episode(self) -> None:
@@ -268,7 +271,7 @@ class DurableWriter:
         with contextlib.suppress(OSError):
             if shutil.disk_usage(self.root).free < _LOW_DISK_BYTES:
                 reason = f"the disk is full ({reason})"
-        if (self.root / JOURNAL).exists():
+        if os.path.lexists(self.root / JOURNAL):  # it never raises
             return (
                 f"Episode {index} is complete on disk, but could not be moved to its place in {self.root}: {reason}. "
                 "It is there as soon as save_episode is called again, or the dataset is opened with --resume=true, and the "
@@ -293,7 +296,7 @@ def check_root(root: Path, *, resume: bool) -> None:
     """
     if root.exists() and not root.is_dir():
         raise DatasetWriteError(f"Cannot write a dataset to {root}: it is a file.")
-    if has_dataset(root) or (root / JOURNAL).is_file():
+    if has_dataset(root):
         if not resume:
             raise FileExistsError(f"{root} already holds a dataset. Append with --resume=true, or choose another root.")
     elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
@@ -310,7 +313,7 @@ def has_dataset(root: Path) -> bool:
         os.listdir(root)
     except FileNotFoundError:
         return False
-    return any(list_files(root, name) for name in (INFO_PATH, "data/chunk-*/file-*", "meta/episodes/*/*"))
+    return any(list_files(root, name) for name in (INFO_PATH, str(JOURNAL), "data/chunk-*/file-*", "meta/episodes/*/*"))
 
 
 def check_undamaged(root: Path) -> None:

@@ -6,7 +6,6 @@ some files of several MB each, and one table of episodes.
 """
 
 import logging
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from lerobot.datasets.video_utils import encode_video_frames, get_video_duration
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_playbyear.datasets.features import Features, is_depth
+from lerobot_playbyear.datasets.files import EPISODES_DIR, is_listed, list_files
 from lerobot_playbyear.datasets.frame_rate import exact_rate
 from lerobot_playbyear.datasets.journal import STAGING, remove_staged
 from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, numpy_to_column, write_rows, write_tables
@@ -99,7 +99,7 @@ def _stats(columns: Mapping[str, Any], features: Features) -> dict[str, Any]:
 
 def _tasks(root: Path, texts: Sequence[str]) -> pd.DataFrame:
     """The dataset's tasks with those of an episode, by their texts."""
-    known = load_tasks(root).task_index.to_dict() if (root / DEFAULT_TASKS_PATH).exists() else {}
+    known = load_tasks(root).task_index.to_dict() if is_listed(root, DEFAULT_TASKS_PATH) else {}
     for text in dict.fromkeys(texts):
         known.setdefault(text, len(known))
     return pd.DataFrame({"task_index": list(known.values())}, index=pd.Index(list(known), name="task"))
@@ -107,7 +107,7 @@ def _tasks(root: Path, texts: Sequence[str]) -> pd.DataFrame:
 
 def _last_row(root: Path) -> tuple[Path | None, dict[str, Any]]:
     """The last table of episodes, and its last row without statistics; nothing in a new dataset."""
-    tables = sorted(root.glob("meta/episodes/*/*.parquet"))
+    tables = list_files(root, f"{EPISODES_DIR}/*/*.parquet")
     if not tables:
         return None, {}
     file = DataFile(tables[-1])
@@ -119,7 +119,7 @@ def _place(root: Path, template: str, last: Mapping[str, Any], prefix: str, chun
     """The first file after the last one that the dataset has not got, and the columns of an episode's row that name it."""
     chunk, file = last.get(f"{prefix}/chunk_index"), last.get(f"{prefix}/file_index")
     chunk, file = (0, 0) if chunk is None or file is None else update_chunk_file_indices(chunk, file, chunks_size)
-    while os.path.lexists(root / template.format(chunk_index=chunk, file_index=file)):
+    while is_listed(root, template.format(chunk_index=chunk, file_index=file)):
         chunk, file = update_chunk_file_indices(chunk, file, chunks_size)
     name = template.format(chunk_index=chunk, file_index=file)
     return Path(name), {f"{prefix}/chunk_index": chunk, f"{prefix}/file_index": file}

@@ -165,9 +165,7 @@ def append_line(path: Path, line: str) -> None:
     with os.fdopen(os.open(path, new, 0o666), "a+b") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 1, 0))
-        begin = (
-            b"" if file.read(1) in (b"", b"\n") else b"\n"
-        )  # half a line, of a full disk or a power cut, stays alone
+        begin = b"" if file.read(1) in (b"", b"\n") else b"\n"  # half a line, of a power cut, stays alone
         file.write(begin + line.encode() + b"\n")
 
 

@@ -264,8 +264,9 @@ def _check_fields(info: Info) -> None:
     if not isinstance(features, dict):
         raise ValueError(f"features is {features!r}; wanted a dtype and a shape for each")
     for key in INDEX_COLUMNS:
-        if key not in features:
-            raise ValueError(f"the feature '{key}' is missing")
+        own, kind = features.get(key), "float" if key == "timestamp" else "int"
+        if not (isinstance(own, dict) and own.get("shape") == [1] and str(own.get("dtype")).startswith(kind)):
+            raise ValueError(f"the feature '{key}' is missing, or not one {kind} in each frame")
     for key, feature in features.items():
         if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
             raise ValueError(f"the feature '{key}' has no dtype")

@@ -8,11 +8,13 @@ moved stays inside the dataset, and no folder is followed that is a link.
 import contextlib
 import os
 import shutil
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from lerobot_playbyear.datasets import files
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, flush_all, write_atomically
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, flush, is_listed
 from lerobot_playbyear.datasets.remedies import repair_command
 
 SCRATCH = Path("images")
@@ -40,9 +42,9 @@ def publish(root: Path) -> None:
         JournalError: A file's place is not inside the dataset.
     """
     _staged_files(root)  # raises where one of them leads elsewhere
-    flush_all(root / STAGING)
+    files.flush_all(root / STAGING)
     flush(root / SCRATCH)
-    write_atomically(root / JOURNAL, "")
+    files.write_atomically(root / JOURNAL, "")
     flush(root)
     finish_journal(root)
 
@@ -52,12 +54,13 @@ def finish_journal(root: Path) -> None:
 
     Raises:
         JournalError: It, or what is to be moved, is none of ours; nothing was moved.
+        OSError: It cannot be looked at now, which is not to say that there is none; or something cannot be moved.
     """
     journal = root / JOURNAL
-    if not os.path.lexists(journal):
+    if not is_listed(root, JOURNAL):
         return
     names = _staged_files(root)
-    if journal.is_symlink() or not journal.is_file():
+    if not stat.S_ISREG(journal.lstat().st_mode):
         remedy = f"If nothing is being recorded there, delete it and run `{repair_command(root)}`"
         raise _error(journal, "is not an ordinary file", remedy)
     for name in names:
@@ -88,7 +91,11 @@ def lock_dataset(root: Path) -> FolderLock:
         OSError: It cannot be written.
     """
     check_scratch(root)
-    return FolderLock(root / LOCK, f"Another process is writing to {root}, or uploading it: wait until it has ended.")
+    new = [folder for folder in (root, *root.absolute().parents) if not folder.exists()]
+    lock = FolderLock(root / LOCK, f"Another process is writing to {root}, or uploading it: wait until it has ended.")
+    for folder in new:  # else a power cut could take them, with all episodes
+        flush(folder.parent)
+    return lock
 
 
 @contextlib.contextmanager
@@ -132,7 +139,7 @@ def _staged_files(root: Path) -> list[Path]:
     check_scratch(root)
     staging = root / STAGING
     names: list[Path] = []
-    for entry in entries_below(staging) if staging.is_dir() else ():
+    for entry in files.entries_below(staging) if is_listed(root, STAGING) else ():
         name = entry.relative_to(staging)
         for path in (entry, root / name):
             if path.is_symlink() and (path == entry or entry.is_dir()):

@@ -8,12 +8,13 @@ and every page carries a checksum, so that a flipped bit is found instead of hea
 import contextlib
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.errors import first_line
@@ -27,7 +28,7 @@ class ParquetDamageError(ValueError):
 PIECE_BYTES = 2**26
 """Of the rows that are in memory together, about: more is read and written in parts."""
 
-_BUFFER_BYTES = 2**20
+_READING = {"page_checksum_verification": True, "pre_buffer": False, "buffer_size": 2**20}
 _COLUMN_BYTES, _OBJECT_BYTES = 4, 20  # of a number, in a column and as Python has it, about
 _IMPOSSIBLE_BYTES = 2**40  # more memory than any part of a file takes
 _PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
@@ -57,12 +58,13 @@ def parsing(path: Path) -> Iterator[None]:
         raise ParquetDamageError(first_line(error)) from error
 
 
-def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.ParquetFile:
+def open_checked(path: Path, footer: pq.FileMetaData | None = None, coded: Sequence[str] = ()) -> pq.ParquetFile:
     """Opens a file for reading with its pages' checksums verified, where it has them.
 
     Args:
         path: The file.
         footer: What is taken for its footer; None: its own.
+        coded: The columns of texts that stay dictionaries.
 
     Raises:
         ParquetDamageError: It is not a complete parquet file.
@@ -73,9 +75,7 @@ def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.Parque
             with path.open("rb") as file:
                 if file.read(4) != b"PAR1":
                     raise ParquetDamageError("it does not begin as a parquet file does")
-        return pq.ParquetFile(
-            path, metadata=footer, page_checksum_verification=True, pre_buffer=False, buffer_size=_BUFFER_BYTES
-        )
+        return pq.ParquetFile(path, metadata=footer, read_dictionary=list(coded), **_READING)
 
 
 def check_room(path: Path, footer: pq.FileMetaData, group: int | None = None) -> None:
@@ -91,12 +91,23 @@ def check_room(path: Path, footer: pq.FileMetaData, group: int | None = None) ->
     """
     groups = map(footer.row_group, range(footer.num_row_groups) if group is None else [group])
     n_values = sum(own.column(i).num_values for own in groups for i in range(own.num_columns))
-    wanted = n_values * (_OBJECT_BYTES if group is None else _COLUMN_BYTES)
+    _check_free(path, f"{n_values:,} values", n_values * (_OBJECT_BYTES if group is None else _COLUMN_BYTES))
+
+
+def _check_free(path: Path, what: str, wanted: int) -> None:
     if wanted > PIECE_BYTES and 2 * wanted > (free := available_memory()):
         raise MemoryError(
-            f"'{path}' holds {n_values:,} values in one piece, which take {wanted / 2**30:.1f} GiB of memory, and "
+            f"'{path}' holds {what} in one piece, which take {wanted / 2**30:.1f} GiB of memory, and "
             f"{free / 2**30:.1f} GiB are free. Use a machine with more, or ask who made the dataset."
         )
+
+
+def _n_bytes(texts: pa.Array) -> int:
+    """What texts take that are coded as dictionaries, or lists and structures of them."""
+    if pa.types.is_dictionary(texts.type):
+        return pc.sum(pc.binary_length(texts.dictionary).take(texts.indices)).as_py() or 0
+    parts = texts.flatten() if pa.types.is_nested(texts.type) else []
+    return sum(map(_n_bytes, parts if isinstance(parts, list) else [parts]))
 
 
 class DataFile:
@@ -191,6 +202,11 @@ def read_table(path: Path) -> pa.Table:
     """
     with open_checked(path) as file, parsing(path):
         check_room(path, file.metadata)
+        leaves = map(file.schema.column, range(len(file.schema)))
+        texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
+        with open_checked(path, file.metadata, texts) as coded:
+            chunks = [chunk for column in coded.read(texts, use_threads=False).columns for chunk in column.chunks]
+        _check_free(path, "texts", sum(map(_n_bytes, chunks)))
         table = file.read(use_threads=False)
         table.validate(full=True)
     return table
@@ -250,9 +266,7 @@ def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> N
 def write_rows(rows: pa.Table, path: Path) -> None:
     """Writes a table of episodes. Its footer carries nothing that a reader could do without: it is most of the file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(
-        rows, path, compression="snappy", write_page_checksum=True, write_statistics=False, store_schema=False
-    )
+    pq.write_table(rows, path, write_page_checksum=True, write_statistics=False, store_schema=False)
 
 
 def writer_options(schema: pa.Schema) -> dict:

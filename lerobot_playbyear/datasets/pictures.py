@@ -3,17 +3,21 @@
 import contextlib
 import io
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 import av
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from PIL import Image
 
-from lerobot_playbyear.datasets.features import is_depth
+from lerobot_playbyear.datasets.features import Features, is_depth
 from lerobot_playbyear.datasets.files import INFO_PATH
-from lerobot_playbyear.datasets.info import OutsideError, ordinary, real_path
+from lerobot_playbyear.datasets.info import OutsideError, list_folder, ordinary, real_path
+from lerobot_playbyear.datasets.parquet import DataFile
 from lerobot_playbyear.datasets.remedies import repair_command, without_feature
 
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
@@ -75,6 +79,35 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
         image.close()
         raise ValueError(f"'{key}': a picture of {size} pixels; {INFO_PATH} gives the shape {tuple(feature['shape'])}")
     return image
+
+
+def named_pictures(root: Path, files: Iterable[DataFile], features: Features) -> set[str]:
+    """The files below `images` that rows name in place of pictures; the others there are of episodes that were not saved.
+
+    Args:
+        root: The dataset's folder.
+        files: Its data files; what is damaged in them names nothing.
+        features: Its features.
+
+    Raises:
+        OSError: They cannot be read now.
+    """
+    if not list_folder(root / "images"):  # as nearly always
+        return set()
+    keys = [key for key, feature in features.items() if feature["dtype"] == "image"]
+    tables = (table for file in files for key in keys for _, table in file.row_groups([f"{key}.path"]))
+    columns = (pc.struct_field(table.column(0), "path") for table in tables if isinstance(table, pa.Table))
+    return {os.path.normpath(name) for column in columns for name in pc.unique(column).to_pylist() if name}
+
+
+def is_unsaved(name: PurePath, named: Collection[str]) -> bool:
+    """Whether a file of a dataset is what an episode was written through, or left behind: it lies below `images`.
+
+    Args:
+        name: Its name in the dataset's folder.
+        named: From `named_pictures`.
+    """
+    return name.parts[0] == "images" and (str(name) not in named or name.parts[1].startswith("."))
 
 
 def encode_picture(picture: Image.Image, is_depth: bool, compress_level: int) -> bytes:

@@ -25,7 +25,7 @@ from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, is_spec
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.frame_rate import frame_rate
 from lerobot_playbyear.datasets.info import INDEX_COLUMNS, check_parts, file_inside, list_folder, nothing_in, read_info
-from lerobot_playbyear.datasets.parquet import PIECE_BYTES, DataFile, column_to_numpy, episode_bounds
+from lerobot_playbyear.datasets.parquet import PIECE_BYTES, DataFile, column_to_numpy, episode_bounds, holds_numbers
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.survey import Survey, survey
@@ -333,8 +333,9 @@ class SurveyedDataset(EpisodeReader):
     @cached_property
     def unreadable(self) -> dict[str, str]:
         """The columns of numbers and of sound that lack values, or whose rows differ in length, and why."""
-        reasons = {}
-        for key in self._columns_of_numbers():
+        numbers = self._columns_of_numbers()
+        reasons = {key: f"'{key}' holds no numbers" for key in self.microphones if key not in numbers}
+        for key in numbers:
             try:
                 for episode in self.episodes:
                     self.values(key, episode)
@@ -348,9 +349,9 @@ class SurveyedDataset(EpisodeReader):
             yield np.broadcast_to(picture, (*picture.shape[:2], 3))
 
     def _columns_of_numbers(self) -> list[str]:
-        others = ("image", "video", "string", "language")
-        vectors = [key for key, own in self.features.items() if own["dtype"] not in others and len(own["shape"]) <= 1]
-        return [key for key in vectors if key not in INDEX_COLUMNS]
+        vectors = [key for key, own in self.features.items() if len(own["shape"]) <= 1 and 0 not in own["shape"]]
+        kinds = {field.name: field.type for field in self.survey.schema if holds_numbers(field.type)}
+        return [key for key in vectors if key in kinds and key not in INDEX_COLUMNS]
 
     def _film(self, key: str, episode: EpisodeRows) -> tuple[Path, float]:
         place = self._places[episode.index][key]

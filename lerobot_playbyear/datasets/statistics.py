@@ -13,13 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot.datasets.compute_stats import (
-    DEFAULT_QUANTILES,
-    aggregate_stats,
-    auto_downsample_height_width,
-    compute_episode_stats,
-    get_feature_stats,
-)
+from lerobot.datasets import compute_stats
 from lerobot.datasets.utils import STATS_PATH, serialize_dict
 
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_keys
@@ -41,7 +35,7 @@ def sound_stats(sound: np.ndarray) -> dict[str, np.ndarray]:
     pooled = {"min": values[0], "max": values[-1], "mean": mean}
     pooled["std"] = np.sqrt(np.square(values - mean) @ counts / sound.size)
     below = np.cumsum(counts)
-    for share in DEFAULT_QUANTILES:
+    for share in compute_stats.DEFAULT_QUANTILES:
         pooled[f"q{int(share * 100):02d}"] = values[np.searchsorted(below, share * sound.size)]
     stats = {name: np.full(n_samples, _rounded(value)) for name, value in pooled.items()}
     return {**stats, "count": np.array([n_frames])}
@@ -54,8 +48,8 @@ def picture_stats(pictures: Iterable[np.ndarray], is_depth: bool = False) -> dic
         pictures: (H, W, C) each; of an episode those that LeRobot's `sample_indices` names.
         is_depth: Whether they are distances, which keep their unit.
     """
-    seen = np.stack([auto_downsample_height_width(picture.transpose(2, 0, 1)) for picture in pictures])
-    stats = get_feature_stats(seen, axis=(0, 2, 3), keepdims=True)
+    seen = np.stack([compute_stats.auto_downsample_height_width(picture.transpose(2, 0, 1)) for picture in pictures])
+    stats = compute_stats.get_feature_stats(seen, axis=(0, 2, 3), keepdims=True)
     scale = 1.0 if is_depth else 255.0
     return {name: value if name == "count" else np.squeeze(value / scale, axis=0) for name, value in stats.items()}
 
@@ -68,7 +62,7 @@ def numeric_stats(columns: Mapping[str, np.ndarray], features: Features) -> Stat
         features: LeRobot features of these columns.
     """
     others = {key: value for key, value in columns.items() if not key.startswith(AUDIO_PREFIX)}
-    stats = compute_episode_stats(others, dict(features)) if others else {}
+    stats = compute_stats.compute_episode_stats(others, dict(features)) if others else {}
     return {**stats, **{key: sound_stats(columns[key].reshape(len(columns[key]), -1)) for key in audio_keys(columns)}}
 
 
@@ -81,7 +75,7 @@ def row_stats(row: Mapping[str, Any]) -> Stats:
     """The statistics in an episode's row of `meta/episodes`, without those that are missing."""
     stats: Stats = {}
     for column, value in row.items():
-        if column.startswith("stats/") and value is not None:
+        if column.startswith("stats/") and column.count("/") > 1 and value is not None:
             key, name = column.removeprefix("stats/").rsplit("/", 1)
             stats.setdefault(key, {})[name] = np.atleast_1d(np.array(value))
     return stats
@@ -90,7 +84,7 @@ def row_stats(row: Mapping[str, Any]) -> Stats:
 def add_stats(total: Stats | None, episodes: Iterable[Stats]) -> Stats:
     """The statistics of a dataset after more episodes, aggregated by LeRobot."""
     parts = [*([total] if total else []), *episodes]
-    summed: Stats = aggregate_stats(parts) if parts else {}
+    summed: Stats = compute_stats.aggregate_stats(parts) if parts else {}
     for key in audio_keys(summed):
         for name, value in summed[key].items():
             if name != "count" and (value == value.flat[0]).all():

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, naming
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
@@ -146,7 +146,7 @@ class Survey:
             return f"{self.root}: {len(self.episodes)} episodes, nothing wrong."
         verdict = "nothing wrong, but" if self.is_undamaged else "it is damaged:"
         lines = [f"{self.root}: {len(self.whole)} whole episodes; {verdict}"]
-        return "\n  - ".join([*lines, *map(str, self.findings)])
+        return "\n  - ".join([*lines, *(printable(each, kept="") for each in self.findings)])
 
 
 def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None, like: Path | None = None) -> Survey:
@@ -218,7 +218,7 @@ def _schema(root: Path, info: Info) -> pa.Schema:
     features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in in_rows.items()}
     try:
         return get_hf_features_from_features(features).arrow_schema
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise DatasetDamagedError(f"{root / INFO_PATH}: LeRobot knows no such feature: {error}. Correct it.") from error
 
 
@@ -253,7 +253,8 @@ def _difference(found: pa.Schema, wanted: pa.Schema) -> str | None:
         return f"its columns are not the dataset's features: {names}"
     for column in wanted:
         own, kind = found.field(column.name).type, column.type
-        if not are_alike(own, kind):
+        is_whole = column.name in INDEX_COLUMNS and pa.types.is_integer(kind)
+        if not are_alike(own, kind) or (is_whole and not pa.types.is_integer(own)):
             return f"its column '{column.name}' is {own}; wanted {kind}"
     return None
 
@@ -409,7 +410,7 @@ def _contradiction(root: Path, info: Info, episode: Episode, frames: Frames) -> 
         return "its tasks are missing"
     names: dict[str, set[str]] = defaultdict(set)
     for column, value in row.items():
-        if column.startswith("stats/") and value is not None:
+        if column.startswith("stats/") and column.count("/") > 1 and value is not None:
             key, name = column.removeprefix("stats/").rsplit("/", 1)
             names[key].add(name)
             if not are_numbers(value):
@@ -457,6 +458,9 @@ def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], found: Se
         counted = f"{INFO_PATH} counts {info['total_episodes']} episodes of {info['total_frames']} frames in all"
         yield _wrong("rows", f"{counted}; there are {len(episodes)} of {n_frames}")
     used = {(each.frames.file.path, each.frames.start) for each in episodes if each.frames}
+    firsts = [each.first_index for each in found if (each.file.path, each.start) in used]
+    if firsts != sorted(firsts):
+        yield _wrong("rows", "the data files are not in the order of their frames, in which LeRobot reads them")
     if is_whole and (others := [each for each in found if (each.file.path, each.start) not in used]):
         names = sorted({each.file.path.relative_to(root).as_posix() for each in others})
         n_others = sum(each.length for each in others)

@@ -83,14 +83,9 @@ def env_facts(env: gym.Env) -> EnvFacts:
         raise RolloutError(
             f"metadata['render_fps'] is {fps}; wanted a whole number of steps per second, such as {round(fps)}."
         )
-    return EnvFacts(
-        observation_space=env.observation_space,
-        action_space=env.action_space,
-        fps=fps,
-        has_expert=callable(getattr(env.unwrapped, "scripted_expert", None)),
-        state_names=getattr(env.unwrapped, "state_names", None),
-        action_names=getattr(env.unwrapped, "action_names", None),
-    )
+    has_expert = callable(getattr(env.unwrapped, "scripted_expert", None))
+    names = (getattr(env.unwrapped, name, None) for name in ("state_names", "action_names"))
+    return EnvFacts(env.observation_space, env.action_space, fps, has_expert, *names)
 
 
 def task_description(env: gym.Env) -> str:

@@ -166,14 +166,6 @@ def play(
         if watch:
             watched.append(watch())
         ended = terminated or truncated or verdict is not None or len(actions) >= limit
-    return Episode(
-        seed=seed,
-        task=task_description(env),
-        observations=observations,
-        actions=np.stack(actions),
-        rewards=np.asarray(rewards, np.float32),
-        successes=np.asarray(successes, bool),
-        interventions=None if expert is None else np.asarray(interventions, bool),
-        verdict=verdict,
-        watched=watched,
-    )
+    by_step = np.stack(actions), np.asarray(rewards, np.float32), np.asarray(successes, bool)
+    corrected = None if expert is None else np.asarray(interventions, bool)
+    return Episode(seed, task_description(env), observations, *by_step, corrected, verdict, watched)

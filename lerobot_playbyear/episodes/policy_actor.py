@@ -42,9 +42,7 @@ class PolicyActor:
     ) -> None:
         self.policy, self._autocast = policy, autocast
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
-        self._env_preprocessor, self._env_postprocessor = make_env_pre_post_processors(
-            env_cfg=env_cfg, policy_cfg=policy.config
-        )
+        self._env_preprocessor, self._env_postprocessor = make_env_pre_post_processors(env_cfg, policy.config)
 
     def reset(self, env: gym.Env) -> None:
         """An episode begins."""

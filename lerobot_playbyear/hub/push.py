@@ -10,7 +10,7 @@ import json
 import logging
 import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,6 +28,7 @@ from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries
 from lerobot_playbyear.datasets.info import check_links, check_links_out, check_there
 from lerobot_playbyear.datasets.journal import locked
 from lerobot_playbyear.datasets.markdown import word
+from lerobot_playbyear.datasets.pictures import is_unsaved, named_pictures
 from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.hub.dataset_card import CARD, FILM, write_dataset_card
 
@@ -41,7 +42,7 @@ _WAITS_S = (1, 2, 5)  # between the tries of a step
 _PASSING = (408, 409, 412, 425, 429)  # and all from 500; 412: a newer commit came before this one
 
 _CONTENT = ("data/", "meta/", "videos/")
-_LEFT_OUT = ("images", CARD, FILM, ".gitattributes", ".git", ".cache")  # scratch; what is made again; what is the Hub's
+_LEFT_OUT = (CARD, FILM, ".gitattributes", ".git", ".cache")  # what is made again; what is the Hub's
 _POLICY_FILES = (  # that saving makes
     *("config.json", "train_config.json", "model*.safetensors", "model.safetensors.index.json"),
     *("policy_preprocessor*", "policy_postprocessor*", "adapter_config.json", "adapter_model.safetensors"),
@@ -183,7 +184,8 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
         try:
             dataset = SurveyedDataset.open(repo_id, folder)
             check_links(folder)
-            files = _files(folder)
+            named = named_pictures(folder, dataset.files, dataset.features)
+            files = _files(folder, named)
             before = _stamps(files)
             license = options.license or "apache-2.0"
             card = write_dataset_card(dataset, repo_id, Path(scratch), options.tags, license, options.preview)
@@ -193,11 +195,11 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
         def upload() -> str:
             from lerobot.datasets import CODEBASE_VERSION
 
-            _check_unchanged(folder, before)
+            _check_unchanged(folder, named, before)
             repository = _create(repo_id, "dataset", options.private)
             # LeRobot reads every file in data/: one that is no longer there must go.
             _commit(repository, files | card, "Upload dataset", stale=_CONTENT)
-            _check_unchanged(folder, before)  # before anyone loads this version
+            _check_unchanged(folder, named, before)  # before anyone loads this version
             _tag(repository, CODEBASE_VERSION, move=True)
             return str(repository)
 
@@ -205,10 +207,11 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
         return _upload(upload, f"The dataset is complete in {folder}", later, options)
 
 
-def _files(folder: Path) -> dict[str, Path]:
-    """What goes up, by the names there."""
+def _files(folder: Path, named: Collection[str]) -> dict[str, Path]:
+    """What goes up, by the names there: of what lies below `images` that which rows name."""
     names = {path.relative_to(folder): path for path in entries_below(folder) if path.is_file()}
-    return {name.as_posix(): path for name, path in names.items() if name.parts[0] not in _LEFT_OUT}
+    own = {name for name in names if name.parts[0] not in _LEFT_OUT and not is_unsaved(name, named)}
+    return {name.as_posix(): path for name, path in names.items() if name in own}
 
 
 def _stamps(files: Mapping[str, Path]) -> dict[str, tuple[int, int]]:
@@ -217,9 +220,9 @@ def _stamps(files: Mapping[str, Path]) -> dict[str, tuple[int, int]]:
     return {name: (stat.st_size, stat.st_mtime_ns) for name, stat in stats.items()}
 
 
-def _check_unchanged(folder: Path, before: Mapping[str, tuple[int, int]]) -> None:
+def _check_unchanged(folder: Path, named: Collection[str], before: Mapping[str, tuple[int, int]]) -> None:
     """Raises a HubError if a dataset is not what it was when its files were listed."""
-    now = _stamps(_files(folder))
+    now = _stamps(_files(folder, named))
     changed = sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
     if changed:
         raise HubError(f"it was changed meanwhile ({', '.join(changed[:3])}). Wait until nothing writes to it any more")

@@ -19,16 +19,7 @@ from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.inspection.motion import check_actions, check_interventions, check_success
 from lerobot_playbyear.inspection.pictures import PictureChecks
 from lerobot_playbyear.inspection.sound import check_sound
-from lerobot_playbyear.inspection.structure import (
-    check_columns,
-    check_finite_numbers,
-    check_lengths,
-    check_sample_rates,
-    check_statistics,
-    check_survey,
-    facts,
-    finite,
-)
+from lerobot_playbyear.inspection.structure import check_sample_rates, check_structure, facts, finite
 
 _COLOURS = {"ok": "32", "info": "36", "warning": "33", "error": "31;1"}
 
@@ -105,11 +96,7 @@ def check_numbers(dataset: SurveyedDataset, action_range: Sequence[float] | None
         action_range: Lowest and highest action allowed; None: see `check_actions`.
     """
     return [
-        *check_survey(dataset),
-        *check_columns(dataset),
-        *check_lengths(dataset),
-        *check_finite_numbers(dataset),
-        *check_statistics(dataset),
+        *check_structure(dataset),
         *check_actions(dataset, action_range),
         *check_interventions(dataset),
         *check_success(dataset),

@@ -81,31 +81,17 @@ class PageWriter(contextlib.ExitStack):
             sound, gain = self._data.sound(episode), self._data.gain
             film = encode(Path(folder) / "film.mp4", frames, len(episode), self._dataset.fps, sound, gain)
             self._write("text/plain", f"film-{position}", _base64_parts(film))
-        self._index.append(
-            {
-                "index": episode.index,
-                "frames": len(episode),
-                "task": self._dataset.task(episode),
-                "success": first_success(self._dataset, episode),
-                "widths": widths,
-                "preview": self._data.preview(episode),
-            }
-        )
+        known = {"index": episode.index, "frames": len(episode), "task": self._dataset.task(episode)}
+        seen = {"success": first_success(self._dataset, episode), "widths": widths}
+        self._index.append({**known, **seen, "preview": self._data.preview(episode)})
 
     def finish(self, findings: Sequence[Finding]) -> None:
         """Writes what concerns the whole dataset, and puts the file into its place."""
-        whole = {
-            "facts": facts(self._dataset),
-            "episodes": self._index,
-            "cameras": self._dataset.cameras,
-            "microphones": self._data.microphones,
-            "gain": self._data.gain,
-            "curves": self._data.curves,
-            "summary": summary(findings),
-            "worst": worst(findings),
-            "verdicts": [{**finding.to_dict(), "figures": None} for finding in findings],
-        }
-        self._write("application/json", "dataset", [_json(whole)])
+        known = {"facts": facts(self._dataset), "episodes": self._index, "cameras": self._dataset.cameras}
+        drawn = {name: getattr(self._data, name) for name in ("microphones", "gain", "curves")}
+        verdicts = [{**finding.to_dict(), "figures": None} for finding in findings]
+        judged = {"summary": summary(findings), "worst": worst(findings), "verdicts": verdicts}
+        self._write("application/json", "dataset", [_json({**known, **drawn, **judged})])
         self._file.write(self._after)
 
     def _write(self, kind: str, name: str, parts: Iterable[str]) -> None:
@@ -181,16 +167,10 @@ class EpisodeData:
             values = self._dataset.values(key).reshape(len(self._dataset), -1)[:, :_MAX_CURVES].astype(np.float64)
             finite = np.where(np.isfinite(values), values, 0)
             names = number_names(self._dataset.features[key]) or [f"[{i}]" for i in range(values.shape[1])]
-            curves.append(
-                {
-                    "key": key,
-                    "names": names[: values.shape[1]],
-                    "unit": str((self._dataset.features[key].get("info") or {}).get("unit", "")),
-                    "low": finite.min(axis=0).tolist(),
-                    "high": finite.max(axis=0).tolist(),
-                    "held": key == "action",  # until the next frame, so drawn as steps
-                }
-            )
+            unit = str((self._dataset.features[key].get("info") or {}).get("unit", ""))
+            curve = {"key": key, "names": names[: values.shape[1]], "unit": unit}
+            curve |= {"low": finite.min(axis=0).tolist(), "high": finite.max(axis=0).tolist()}
+            curves.append({**curve, "held": key == "action"})  # until the next frame, so drawn as steps
         return curves
 
     def sound(self, episode: EpisodeRows) -> list[np.ndarray]:

@@ -17,6 +17,12 @@ _STATS_TOLERANCE, _STD_TOLERANCE = 0.02, 0.05  # of a value's range, and of its 
 _ROUNDING = 2.0**-23  # for each number in a sum: LeRobot sums values and their squares in float32, episode by episode
 
 
+def check_structure(dataset: SurveyedDataset) -> Iterator[Finding]:
+    """All checks below but that of sample rates."""
+    for check in (check_survey, check_columns, check_lengths, check_finite_numbers, check_statistics):
+        yield from check(dataset)
+
+
 def check_survey(dataset: SurveyedDataset) -> Iterator[Finding]:
     """Files, rows, times and tasks: what is wrong with the episodes that are looked at."""
     every, asked = dataset.survey.findings, dataset.chosen

@@ -1,8 +1,8 @@
 """The repaired copy of a dataset: every episode that a survey calls whole; what is wrong around it is made again."""
 
 import shutil
-from collections import defaultdict
 from collections.abc import Collection, Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,20 +13,13 @@ from lerobot.datasets.compute_stats import sample_indices
 from lerobot.datasets.io_utils import write_json, write_tasks
 
 from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
+from lerobot_playbyear.datasets import statistics
 from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, EPISODES_DIR, INFO_PATH, entries_below, fits
 from lerobot_playbyear.datasets.info import STATS_PATH
 from lerobot_playbyear.datasets.parquet import write_rows, write_tables
+from lerobot_playbyear.datasets.pictures import is_unsaved, named_pictures
 from lerobot_playbyear.datasets.reader import SurveyedDataset
-from lerobot_playbyear.datasets.statistics import (
-    Stats,
-    add_stats,
-    numeric_stats,
-    picture_stats,
-    row_stats,
-    stats_columns,
-    write_stats,
-)
 from lerobot_playbyear.datasets.survey import TASKS_PATH, Episode, Frames, Survey, unknown_task
 
 _REMADE = (INFO_PATH, STATS_PATH, TASKS_PATH, "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet")
@@ -55,7 +48,7 @@ def write_copy(survey: Survey, target: Path) -> None:
         numbers = range(max(survey.tasks, default=-1) + 1)  # LeRobot finds a task by its place
         texts = [survey.tasks.get(number, unknown_task(number)) for number in numbers]
         write_tasks(pd.DataFrame({"task_index": list(numbers)}, index=pd.Index(texts, name="task")), target)
-    write_stats(add_stats(None, map(row_stats, rows)), target)
+    statistics.write_stats(statistics.add_stats(None, map(statistics.row_stats, rows)), target)
     n_frames = sum(row["length"] for row in rows)
     counts = {"total_episodes": len(rows), "total_frames": n_frames, "total_tasks": len(survey.tasks)}
     is_complete = len(rows) == len(survey.episodes)
@@ -65,17 +58,19 @@ def write_copy(survey: Survey, target: Path) -> None:
 
 def _copy_rest(survey: Survey, target: Path) -> None:
     """Films, a card, notes, files of other tools: all but the frames, the tables and what an unsaved episode left."""
+    features, whole = survey.info["features"], (episode.frames for episode in survey.whole)
+    named = named_pictures(survey.root, {frames.file for frames in whole if frames}, features)
     for path in entries_below(survey.root):
         name = path.relative_to(survey.root)
-        if path.is_file() and not _is_scratch(name, survey.info["features"]) and not fits(name, *_REMADE):
+        if path.is_file() and not _is_scratch(name, features, named) and not fits(name, *_REMADE):
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(path, target / name)  # no link: LeRobot may write into a film that is there
 
 
-def _is_scratch(name: Path, features: Collection[str]) -> bool:
+def _is_scratch(name: Path, features: Collection[str], named: Collection[str]) -> bool:
     """Whether a file is what was only needed while an episode was written."""
-    folder, inside = name.parts[0], name.parts[1:2]
-    return folder == "images" and bool(inside) and (inside[0] in features or inside[0].startswith("."))
+    inside = name.parts[1:2]
+    return is_unsaved(name, named) and bool(inside) and (inside[0] in features or inside[0].startswith("."))
 
 
 class _Kept(NamedTuple):
@@ -103,25 +98,21 @@ class _Kept(NamedTuple):
 def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
     """Writes the frames, file by file. Returns the episodes' rows."""
     dataset, first_index = SurveyedDataset(survey.root.name, survey), 0
-    by_file: dict[Path, list[_Kept]] = defaultdict(list)
+    every: list[_Kept] = []
     for number, episode in enumerate(survey.whole):
         assert episode.frames is not None
-        by_file[episode.frames.file.path].append(_Kept(episode, episode.frames, number, first_index))
+        every.append(_Kept(episode, episode.frames, number, first_index))
         first_index += episode.frames.length
-    for place, kept in enumerate(by_file.values()):
+    # The order of the files is that of the frames, whatever it was.
+    for place, kept in enumerate(list(own) for _, own in groupby(every, lambda one: one.frames.file.path)):
         chunk, number = divmod(place, survey.info["chunks_size"])
         name = target / DEFAULT_DATA_PATH.format(chunk_index=chunk, file_index=number)
         write_tables(name, (one.table() for one in kept), kept[0].frames.file.schema)
         for one in kept:
-            places = {
-                "episode_index": one.number,
-                "data/chunk_index": chunk,
-                "data/file_index": number,
-                "dataset_from_index": one.first_index,
-                "dataset_to_index": one.first_index + one.frames.length,
-                "meta/episodes/chunk_index": 0,
-                "meta/episodes/file_index": 0,
-            }
+            places = {"episode_index": one.number, "data/chunk_index": chunk, "data/file_index": number}
+            end = one.first_index + one.frames.length
+            places |= {"dataset_from_index": one.first_index, "dataset_to_index": end}
+            places |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
             yield {**_row(dataset, one), **places}
 
 
@@ -131,12 +122,13 @@ def _row(dataset: SurveyedDataset, kept: _Kept) -> dict[str, Any]:
     row = kept.episode.row
     if not row or kept.episode.contradiction:
         texts = [dataset.tasks.get(task, unknown_task(task)) for task in kept.frames.tasks]
-        return {"tasks": texts, "length": kept.frames.length, **stats_columns(_episode_stats(dataset, kept)), **places}
-    moved = stats_columns(numeric_stats(kept.numbers(), dataset.features))
+        stats = statistics.stats_columns(_episode_stats(dataset, kept))
+        return {"tasks": texts, "length": kept.frames.length, **stats, **places}
+    moved = statistics.stats_columns(statistics.numeric_stats(kept.numbers(), dataset.features))
     return {**row, **{name: value for name, value in moved.items() if name in row}, **places}
 
 
-def _episode_stats(dataset: SurveyedDataset, kept: _Kept) -> Stats:
+def _episode_stats(dataset: SurveyedDataset, kept: _Kept) -> statistics.Stats:
     """The statistics of one episode, as LeRobot has them: of pictures, from as many as it samples.
 
     Raises:
@@ -144,14 +136,14 @@ def _episode_stats(dataset: SurveyedDataset, kept: _Kept) -> Stats:
     """
     (episode,) = (each for each in dataset.episodes if each.index == kept.episode.number)
     numbers: dict[str, np.ndarray] = {}
-    stats: Stats = {}
+    stats: statistics.Stats = {}
     sampled = set(sample_indices(len(episode)))
     for key, feature in dataset.features.items():
         if is_depth(feature) or feature["dtype"] in ("string", "language"):
             continue
         if feature["dtype"] in ("image", "video"):
             pictures = enumerate(dataset.pictures(key, episode))
-            stats[key] = picture_stats(picture for number, picture in pictures if number in sampled)
+            stats[key] = statistics.picture_stats(picture for number, picture in pictures if number in sampled)
         else:
             numbers[key] = dataset.values(key, episode)
-    return {**numeric_stats(numbers | kept.numbers(), dataset.features), **stats}
+    return {**statistics.numeric_stats(numbers | kept.numbers(), dataset.features), **stats}

@@ -27,6 +27,7 @@ BOOL_TRUE, BOOL_FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRU
 _MAGIC = b"PAR1"
 _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 0, 2, 3
 _MAX_HEADER_BYTES = 2**16
+_MOST_PAGES = 1000  # of an episode's first column: a stranger's may be of one byte
 
 
 class ThriftError(ValueError):
@@ -144,7 +145,7 @@ def _row_groups(pages: list[_Page], values_per_row: list[int]) -> list[tuple[int
 def _next_row_group(pages: list[_Page], start: int, values_per_row: list[int]) -> tuple[int, _Chunks] | None:
     """The row group that begins at a page. How many rows it has, its first column tells in one of a few ways."""
     n_values = 0
-    for at in range(start, len(pages)):
+    for at in range(start, min(start + _MOST_PAGES, len(pages))):
         if pages[at].is_dictionary:
             if at > start:
                 return None

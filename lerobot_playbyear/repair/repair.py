@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_playbyear.datasets.errors import InputError, printable
-from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder
+from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, is_listed, new_folder
 from lerobot_playbyear.datasets.findings import Finding
 from lerobot_playbyear.datasets.info import check_links, check_parts, check_there
 from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, locked
+from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
 from lerobot_playbyear.repair.footers import rescue
 
@@ -72,13 +73,11 @@ class RepairReport:
         if moved:
             more = " ..." if len(moved) > _MOST_MOVES else ""
             lines.append(f"Renumbered: {', '.join(moved[:_MOST_MOVES])}{more}.")
-        lines.append(
-            f"A copy with {len(self.kept)} whole episodes is in {self.target}; {self.survey.root} is as it was."
-        )
+        root = self.survey.root
+        lines.append(f"A copy with {len(self.kept)} whole episodes is in {self.target}; {root} is as it was.")
         if self.left:
             lines.append(f"What is left to be done in the copy: {'. '.join(each.remedy for each in self.left)}.")
-        old, new = shlex.quote(str(self.survey.root)), shlex.quote(str(self.target))
-        aside = shlex.quote(f"{self.survey.root}_damaged")
+        old, aside, new = (shlex.quote(str(each)) for each in (root, f"{root}_damaged", self.target))
         lines.append(f"To put it in the dataset's place: mv {old} {aside} && mv {new} {old}")
         return "\n".join(lines)
 
@@ -100,6 +99,11 @@ def look(root: Path, like: Path | None = None) -> RepairReport:
     """What a repair would keep. Arguments and errors as for `repair_dataset`."""
     if like is not None and not (like / INFO_PATH).is_file():
         raise InputError(f"--like={like} holds no LeRobotDataset: no {INFO_PATH}. Give one with the same settings.")
+    if root.is_dir() and is_listed(root, JOURNAL):
+        raise InputError(
+            f"An episode in {root / JOURNAL.parent} is complete, and still has to be moved into its place: it would be called "
+            f"lost. Make the folder writable, or work on a copy that is, and run `{repair_command(root)}`."
+        )
     report = RepairReport(survey(root, rescue=rescue, like=like))
     if report.survey.damage and not report.kept and like is None:
         check_parts(root, can_be_repaired=True)
@@ -124,7 +128,8 @@ def repair_dataset(root: str | Path, target: str | Path | None = None, like: Pat
     Raises:
         DatasetDamagedError: No episode in it is whole.
         OutsideError: A link leads out of its folder: the copy would hold what it leads to.
-        InputError: It is no dataset, or the copy's folder is there already, or cannot be made.
+        InputError: It is no dataset, or the copy's folder is there already, or cannot be made; or an episode still has to be
+            moved into place, and nothing can be written there.
         OSError: Something cannot be read now, or the copy cannot be written.
         MemoryError: There is no room for something.
     """

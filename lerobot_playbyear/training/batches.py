@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 Batch = dict[str, Any]
 
+Renamed = Mapping[str, str] | None
+"""The dataset's names of observations, with what the policy calls them."""
+
 _AHEAD = 2
 
 
@@ -129,9 +132,7 @@ class PolicyWindows:
         action_deltas: Where the actions of an item lie, in frames from its last one.
     """
 
-    def __init__(
-        self, policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
-    ) -> None:
+    def __init__(self, policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename_map: Renamed = None) -> None:
         names = dataset_names(policy, rename_map)
         self._deltas = {names[key]: list(range(1 - n, 1)) for key, n in _history(policy).items()}
         self._deltas[ACTION] = self.action_deltas = list(policy.action_delta_indices)
@@ -145,7 +146,7 @@ class PolicyWindows:
         return store.windows(last_frames, self._deltas)
 
 
-def dataset_names(policy: PlaybyearConfig, rename_map: Mapping[str, str] | None = None) -> dict[str, str]:
+def dataset_names(policy: PlaybyearConfig, rename_map: Renamed = None) -> dict[str, str]:
     """What the dataset calls each observation of the policy."""
     original = {renamed: key for key, renamed in (rename_map or {}).items()}
     return {key: original.get(key, key) for key in policy.input_features or {}}

@@ -105,9 +105,7 @@ def dataset_identity(reader: DatasetReader, features: Mapping[str, Any]) -> dict
         "fps": reader.fps,
         "tolerance_s": TOLERANCE_S,
         "episodes": episodes,
-        "video_starts": {
-            key: [meta.episodes[episode][f"videos/{key}/from_timestamp"] for episode in episodes] for key in cameras
-        },
+        "video_starts": {key: [meta.episodes[i][f"videos/{key}/from_timestamp"] for i in episodes] for key in cameras},
         "files": {name: _stamp(file_inside(root, name)) for name in sorted(names)},
     }
 

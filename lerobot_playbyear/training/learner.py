@@ -28,15 +28,10 @@ from lerobot.utils.random_utils import load_rng_state
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
-from lerobot_playbyear.compat import (
-    eval_policy_all,
-    get_step_checkpoint_dir,
-    get_step_identifier,
-    save_checkpoint,
-)
+from lerobot_playbyear.compat import eval_policy_all, get_step_checkpoint_dir, get_step_identifier, save_checkpoint
 from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.features import is_depth, number_names
-from lerobot_playbyear.datasets.files import INFO_PATH, new_folder, parse_json, replace_link
+from lerobot_playbyear.datasets.files import INFO_PATH, flush_all, new_folder, parse_json, replace_link
 from lerobot_playbyear.datasets.remedies import without_feature
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
@@ -44,7 +39,7 @@ from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import VisionEncoder
 from lerobot_playbyear.policy.processor_playbyear import microphone_step
-from lerobot_playbyear.training.batches import dataset_names
+from lerobot_playbyear.training.batches import Renamed, dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 _DTYPES = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}
@@ -130,9 +125,14 @@ class Learner:
         """Write a checkpoint where lerobot-train would, as a whole or not at all, and return its folder."""
         folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
         folder.parent.mkdir(parents=True, exist_ok=True)
+        aside = folder.with_name(f".{folder.name}.old")
         with new_folder(folder) as partial:
             self.write_checkpoint(partial, cfg)
-            shutil.rmtree(folder, ignore_errors=True)  # of an attempt that went further than what this one began with
+            flush_all(partial)
+            shutil.rmtree(aside, ignore_errors=True)
+            if folder.is_dir():  # of an attempt that went further than what this one began with
+                folder.rename(aside)
+        shutil.rmtree(aside, ignore_errors=True)
         replace_link(folder.with_name(LAST_CHECKPOINT_LINK), folder.name)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
             push_checkpoint(folder, cfg.policy.repo_id, cfg.policy.private)
@@ -140,17 +140,10 @@ class Learner:
 
     def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:
         """Write LeRobot's checkpoint into a folder."""
-        save_checkpoint(
-            self.accelerator,
-            cfg,
-            checkpoint_dir=folder,
-            step=self.step,
-            policy=self.unwrapped,
-            optimizer=self.optimizer,
-            scheduler=self.scheduler,
-            preprocessor=self.preprocessor,
-            postprocessor=self.postprocessor,
-        )
+        parts = {
+            name: getattr(self, name) for name in ("step", "optimizer", "scheduler", "preprocessor", "postprocessor")
+        }
+        save_checkpoint(self.accelerator, cfg, checkpoint_dir=folder, policy=self.unwrapped, **parts)
 
     def evaluate(self, cfg: PlaybyearTrainConfig, n_videos: int = 4) -> dict[str, Any]:
         """Roll the policy out in the run's environment through LeRobot's `eval_policy_all`, and return its report.
@@ -336,9 +329,7 @@ def load_training_state(checkpoint: Path, optimizer: Optimizer, scheduler: Any) 
         raise ValueError(f"{folder / TRAINING_STEP} is damaged: {error}. Put it back from a copy.") from error
 
 
-def check_dataset_suits(
-    policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
-) -> None:
+def check_dataset_suits(policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename_map: Renamed = None) -> None:
     """Refuse a dataset whose frame rate or features a policy was not made for.
 
     Raises:

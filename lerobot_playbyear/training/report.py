@@ -161,7 +161,7 @@ class Figures:
     """
 
     def __init__(self, batch_size: int, store: EpisodeStore, step: int, accelerator: Accelerator) -> None:
-        meters = {
+        means = {
             "loss": AverageMeter("loss", ":.3f", reduction="mean"),
             "grad_norm": AverageMeter("grdn", ":.3f"),
             "lr": AverageMeter("lr", ":0.1e"),
@@ -169,10 +169,8 @@ class Figures:
             "dataloading_s": AverageMeter("data_s", ":.3f", reduction="max"),
         }
         if torch.cuda.is_available():
-            meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
-        self._tracker = metrics_tracker(
-            accelerator, batch_size, len(store), store.n_episodes, meters, initial_step=step
-        )
+            means["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
+        self._tracker = metrics_tracker(accelerator, batch_size, len(store), store.n_episodes, means, initial_step=step)
         self._waiting: list[Mapping[str, Any]] = []
 
     def add(self, figures: Mapping[str, Any]) -> None:

@@ -151,6 +151,11 @@ class EpisodeStore:
         episode_index, frame_index, task_index = (columns.pop(key).cpu() for key in _NUMBERING)
         starts, ends = _episodes(episode_index, frame_index, columns.get(IS_FIRST), reader)
         tasks = list(reader.meta.tasks.index)
+        if nameless := sorted(set(task_index.tolist()) - set(range(len(tasks)))):
+            raise InputError(
+                f"Frames of '{reader.repo_id}' are of task {', '.join(map(str, nameless[:8]))}, which has no text in "
+                "meta/tasks.parquet. Put a table from a copy in its place, or correct the frames' task_index."
+            )
         store = cls(columns, starts, ends, reader.fps, tasks, device, image_size, task_index)
         store.place = place
         return store

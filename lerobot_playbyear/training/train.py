@@ -47,7 +47,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         HubError: After it, if the Hub does not take the policy.
     """
     init_logging()
-    with errors_of_input(FileNotFoundError, MemoryError):
+    with errors_of_input(OSError, MemoryError):
         _check(cfg)
         assert isinstance(cfg.policy, PlaybyearConfig)
         accelerator = make_accelerator(cfg.policy)
@@ -86,9 +86,8 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         print_results(cfg, report.success, report.acted_early)
         if cfg.policy.push_to_hub:
             # The last checkpoint is on disk, and stays there.
-            folder = (Path(str(cfg.output_dir)) / "checkpoints" / "last") if cfg.save_checkpoint else learner.save(cfg)
-            options = PushOptions(cfg.policy.private)
-            print(f"On the Hub: {push_policy(folder / 'pretrained_model', str(cfg.policy.repo_id), options)}")
+            folder = str(cfg.output_dir) if cfg.save_checkpoint else learner.save(cfg)
+            print(f"On the Hub: {push_policy(folder, str(cfg.policy.repo_id), PushOptions(cfg.policy.private))}")
     accelerator.wait_for_everyone()  # gloo may hang if a group ends while a sum of tensors has just been made
     accelerator.end_training()
     return Path(str(cfg.output_dir))
@@ -161,9 +160,8 @@ def _check_links(run: Path) -> None:
     check_no_links(run, METRICS_NAME, *RUN_FOLDERS)
     folders = [run / name for name in (CHECKPOINTS_DIR, "eval") if (run / name).is_dir()]
     there = [path.relative_to(run) for folder in folders for path in entries_below(folder)]
-    own = [
-        Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK + ending) for ending in ("", PARTIAL)
-    ]  # PARTIAL: it was killed there
+    # PARTIAL: it was killed there.
+    own = [Path(CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK + ending) for ending in ("", PARTIAL)]
     check_no_links(run, *(str(path) for path in there if path not in own))
 
 
