@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, PutAside, raise_all
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
-from lerobot_playbyear.audio.dataset_copy import AddedColumn, Columns, came_from_the_hub
+from lerobot_playbyear.audio.dataset_copy import AddedColumn, Columns
 from lerobot_playbyear.audio.microphone_pictures import (
     SESSIONS,
     SessionSound,
@@ -34,6 +34,7 @@ from lerobot_playbyear.datasets.features import (
 )
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.frame_rate import nearest_sample_rate
+from lerobot_playbyear.datasets.info import came_from_the_hub
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.remedies import without_episodes
 from lerobot_playbyear.datasets.statistics import numeric_stats

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from huggingface_hub.constants import HF_HUB_CACHE
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_stats
 from lerobot.utils.constants import DEFAULT_FEATURES
@@ -18,16 +17,8 @@ from tqdm import tqdm
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import Features
-from lerobot_playbyear.datasets.files import (
-    EPISODES_DIR,
-    HF_LEROBOT_HOME,
-    INFO_PATH,
-    entries_below,
-    fits,
-    list_files,
-    new_folder,
-)
-from lerobot_playbyear.datasets.info import STATS_PATH, read_info
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, list_files, new_folder
+from lerobot_playbyear.datasets.info import DOWNLOADED, STATS_PATH, came_from_the_hub, read_info
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
     ParquetDamageError,
@@ -43,7 +34,6 @@ from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.statistics import add_stats, stats_columns, write_stats
 
 _SCRATCH = (".cache", ".git")  # what is in these folders is not the dataset's
-_DOWNLOADED = Path(".cache/huggingface")  # is in the folder of what came from the Hub
 _DATA, _EPISODES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet"
 
 
@@ -105,7 +95,7 @@ def _write_files(root: Path, target: Path, added: Columns, removed: Collection[s
     names = [path.relative_to(root) for path in entries_below(root) if path.is_file()]
     paths = [root / name for name in names if name.parts[0] not in _SCRATCH and not is_unsaved(name, named)]
     if came_from_the_hub(root):
-        (target / _DOWNLOADED).mkdir(parents=True)
+        (target / DOWNLOADED).mkdir(parents=True)
     for path in tqdm(paths, desc="Writing", unit="file"):
         name = path.relative_to(root)
         if name.parts[0] == AUDIO_FOLDER and any(key in name.parts for key in removed):
@@ -161,10 +151,3 @@ def _write_rows(source: Path, target: Path, stats: Sequence[Mapping], removed: C
     for name in more[0] if more else ():
         rows = rows.append_column(name, pa.array([own[name] for own in more]))
     write_rows(rows.replace_schema_metadata(None), target)
-
-
-def came_from_the_hub(root: Path) -> bool:
-    """Whether a dataset's folder is one that LeRobot or the Hub's client downloaded, or a copy of one."""
-    caches = [Path(HF_HUB_CACHE).resolve(), (HF_LEROBOT_HOME / "hub").resolve()]
-    is_in_cache = any(root.resolve().is_relative_to(cache) for cache in caches)
-    return is_in_cache or (root / _DOWNLOADED).exists()

@@ -12,12 +12,14 @@ from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
 import numpy as np
+from huggingface_hub.constants import HF_HUB_CACHE
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     DEFAULT_VIDEO_PATH,
     EPISODES_DIR,
+    HF_LEROBOT_HOME,
     INFO_PATH,
     entries_below,
     fits,
@@ -33,6 +35,7 @@ Info = Mapping[str, Any]
 """The fields of `meta/info.json`."""
 
 STATS_PATH = "meta/stats.json"
+DOWNLOADED = ".cache/huggingface"  # is in the folder of what came from the Hub
 
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """That every dataset of LeRobot's has."""
@@ -297,3 +300,10 @@ def _check_templates(root: Path, info: Info) -> None:
             raise OutsideError(f"{root / INFO_PATH}: {name} is {template!r}; wanted something like {default!r}.")
         for key in keys or [""]:
             file_inside(root, template.format(video_key=key, chunk_index=0, file_index=0))
+
+
+def came_from_the_hub(root: Path) -> bool:
+    """Whether a dataset's folder is one that LeRobot or the Hub's client downloaded, or a copy of one."""
+    caches = [Path(HF_HUB_CACHE).resolve(), (HF_LEROBOT_HOME / "hub").resolve()]
+    is_in_cache = any(root.resolve().is_relative_to(cache) for cache in caches)
+    return is_in_cache or (root / DOWNLOADED).exists()

@@ -83,9 +83,9 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
     random; `reset(options={"cube_position": (x, y), "cube_yaw": yaw})` sets them.
 
     ## Episode Termination
-    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was moved more than 2.2 cm before both fingers held it;
-    "pressed", when the hand pressed on the cube with more than 5 N, which stops an arm for people (a squeeze between the
-    fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
+    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was moved more than 2.2 cm before both fingers
+    held it; "pressed", when the hand pressed on the cube with more than 5 N, which stops an arm for people (a squeeze between
+    the fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
     `horizon` steps (250): enough for a second search after a failed grasp.
 
     ## Arguments
@@ -142,9 +142,9 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     them.
 
     ## Episode Termination
-    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was moved more than 2.2 cm before both fingers held it;
-    "pressed", when the hand pressed on the cube with more than 5 N, which stops an arm for people (a squeeze between the
-    fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
+    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was moved more than 2.2 cm before both fingers
+    held it; "pressed", when the hand pressed on the cube with more than 5 N, which stops an arm for people (a squeeze between
+    the fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
     `horizon` steps (400): enough for a second search after a failed grasp.
 
     ## Arguments
