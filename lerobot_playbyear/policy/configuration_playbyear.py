@@ -22,7 +22,7 @@ from lerobot_playbyear.policy.optimization import DTYPES, PlaybyearSchedulerConf
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
 
-_SIZES = {
+_SIZES: dict[str, float] = {
     "n_frame_stack": 100,
     "n_memory_steps": 10_000,
     "n_supervised_steps": 10_000,
