@@ -170,7 +170,8 @@ def interventions() -> list[str]:
     best, best_placed = ([f"{best_rate(row):.0f}" for row in table["full"]] for table in (by_name, placed))
     return [
         *(f"| {' | '.join(f'{each(own)} %' if own else '-' for own in table.values())} |" for table in tables),
-        f"The best three checkpoints of HG-DAgger, chosen on other seeds: {', '.join(best)} %, and {', '.join(best_placed)} %.",
+        f"The best three checkpoints of HG-DAgger, chosen on other seeds: {', '.join(best)} %; Pick and Place "
+        f"{', '.join(best_placed)} %.",
         f"100 corrected episodes take {listed(corrected)} operator minutes, failed scenes {listed(shown)}.",
     ]
 

@@ -41,6 +41,21 @@ def test_who_watches_changes_nothing():
     assert episode(True) == episode(False)
 
 
+def test_what_moved_is_drawn_again_and_what_did_not_is_the_same():
+    env = make("OccludedGrasp-v1")
+    env.reset_physics(seed=0)
+    first = env.render()
+    first[:] = 0  # a caller's own
+    again = env.render()
+    assert again.any()
+    np.testing.assert_array_equal(env.render(), again)
+    env.step_physics(np.array([0, 1, 0, -1]))
+    assert (env.render() != again).any()
+    env.reset_physics(seed=0, options={"cube_position": (0.0, -0.2)})
+    assert (env.render() != again).any()
+    env.close()
+
+
 def red(picture: np.ndarray) -> int:
     r, g, b = picture.astype(int).transpose(2, 0, 1)
     return int(((r > 1.8 * g) & (r > 1.8 * b) & (r > 60)).sum())

@@ -273,12 +273,16 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
         InputError: `offsets` is not a list of as many numbers.
     """
     offset = cfg.offset or 0.0
+    if not np.isfinite(offset):
+        raise InputError(f"--offset={offset}: wanted seconds, such as 0.25.")
     if cfg.offsets is None:
         return [offset] * n_episodes
     try:
         values = parse_json(cfg.offsets.read_bytes())
-        if not isinstance(values, list):
-            raise ValueError(f"it holds {type(values).__name__}")
+        if not isinstance(values, list) or not np.isfinite(values).all():
+            raise ValueError(
+                f"it holds {printable(str(values)[:40])}; wanted [0.5, 1.2, ...], seconds for each episode"
+            )
         values = [float(value) for value in values]
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"--offsets={cfg.offsets} is not a list of numbers in JSON: {error}") from error
@@ -312,7 +316,7 @@ def _read(sources: list[Source], cfg: AttachAudioConfig, dataset: DatasetReader,
                 rate = _new_rate(cfg, own_rate, fps, source.is_own)
                 first_with.setdefault(rate, episode)
                 sound.append(cut_into_frames(samples, own_rate, fps, len(rows), start_s, cfg.pad, rate, speed))
-            except (AudioFileError, ValueError, OverflowError) as error:  # --offset=inf
+            except (AudioFileError, ValueError) as error:
                 errors.append(f"{source.named(episode)}{error}")
         if len(first_with) > 1:
             each = ", ".join(f"{rate} Hz (episode {first_with[rate]})" for rate in sorted(first_with))

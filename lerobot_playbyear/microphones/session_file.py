@@ -71,10 +71,11 @@ class SessionFile:
     def _write_new(self) -> None:
         end = self._written()
         while True:
-            if self._written() - self._n > self._n_kept:
-                raise OSError("the disk was too slow, and sound is lost")
             stop = min(end, self._n + _BLOCK)
-            self._write(self._samples(self._n, stop).astype("<i2").tobytes(), HEADER_BYTES + 2 * self._n)
+            samples = self._samples(self._n, stop)
+            if self._written() - self._n > self._n_kept:  # now: they may have gone while they were read
+                raise OSError("the disk was too slow, and sound is lost")
+            self._write(samples.astype("<i2").tobytes(), HEADER_BYTES + 2 * self._n)
             self._n = stop
             if stop == end:
                 break

@@ -140,9 +140,8 @@ class Learner:
 
     def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:
         """Write LeRobot's checkpoint into a folder."""
-        parts = {
-            name: getattr(self, name) for name in ("step", "optimizer", "scheduler", "preprocessor", "postprocessor")
-        }
+        names = ("step", "optimizer", "scheduler", "preprocessor", "postprocessor")
+        parts = {name: getattr(self, name) for name in names}
         save_checkpoint(self.accelerator, cfg, checkpoint_dir=folder, policy=self.unwrapped, **parts)
 
     def evaluate(self, cfg: PlaybyearTrainConfig, n_videos: int = 4) -> dict[str, Any]:
