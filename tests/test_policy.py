@@ -106,6 +106,7 @@ def test_only_low_dimensional_observations_and_the_action_are_normalised():
         {"use_vision": False},
         {"use_memory": False},
         {"cameras": ("front", "side"), "microphones": ("gripper", "table")},
+        {"microphones": ("gripper", "room"), "reference_microphone": "room", "audio_envelope_gain": 1.0},
     ],
     ids=str,
 )

@@ -20,7 +20,7 @@ _FAR = 1.0  # [normalised units] what is farther away is told as that far: carry
 
 def weights_of(config: PlaybyearConfig) -> dict[str, float]:
     """The weight of each kind of loss. A policy leaves out what it has not ears, or a body, enough for: all take one preset."""
-    n_ears = len(config.audio_keys) if config.use_audio else 0
+    n_ears = len(config.audio_keys) - (config.reference_key is not None) if config.use_audio else 0
     can = {"onset": n_ears >= 1, "balance": n_ears >= 2, "way": n_ears >= 1 and bool(config.low_dimensional_keys)}
     return {kind: getattr(config, f"auxiliary_{kind}") if is_able else 0.0 for kind, is_able in can.items()}
 

@@ -66,6 +66,8 @@ class PlaybyearConfig(PreTrainedConfig):
         segment_s, hop_s: Segment length and hop length of the spectrogram [s].
         n_frequency_bins: Number of frequency bins kept from the lowest up. A bin is 1 / segment_s wide.
         image_size: Height and width of the images for the vision encoder [pixels]. 84 trains about five times faster than 224.
+        reference_microphone: Name of a microphone that stands in the room, away from the arm. What it hears, to within 10 dB of
+            what another one does, each relative to its usual background, is taken out of that one's spectrogram. None: none.
         audio_steps: Names in LeRobot's ProcessorStepRegistry: processing steps for the sound before the network, in training
             and at rollout. A trained policy keeps its own (`extension.MicrophoneStep`).
         extension_options: Options of encoders and `audio_steps` of other packages, by their names, such as `{waveform_cnn:
@@ -137,6 +139,7 @@ class PlaybyearConfig(PreTrainedConfig):
     hop_s: float = 0.035
     n_frequency_bins: int = 160
     image_size: int = 224
+    reference_microphone: str | None = None
     audio_steps: tuple[str, ...] = ()
     extension_options: dict[str, dict[str, Any]] = field(default_factory=dict)
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -202,6 +205,11 @@ class PlaybyearConfig(PreTrainedConfig):
     def audio_keys(self) -> list[str]:
         """One per microphone, sorted."""
         return sorted(key for key in self.input_features or {} if key.startswith(AUDIO_PREFIX))
+
+    @property
+    def reference_key(self) -> str | None:
+        """Of the microphone that is heard to be taken out."""
+        return None if self.reference_microphone is None else f"{AUDIO_PREFIX}{self.reference_microphone}"
 
     @property
     def camera_keys(self) -> list[str]:
@@ -379,6 +387,11 @@ class PlaybyearConfig(PreTrainedConfig):
             return
         if not self.audio_keys:
             raise ValueError(_no_microphone_in(features))
+        if self.reference_key and {self.reference_key} & {*self.audio_keys} in (set(), {*self.audio_keys}):
+            raise ValueError(
+                f"--policy.reference_microphone={self.reference_microphone} must be one of two microphones or more, and the "
+                f"observations have {self.audio_keys}: name one of them, or leave the option out."
+            )
         if self.sample_rate is None:
             raise ValueError(f"The sample rate of {self.audio_keys} is not known: set --policy.sample_rate.")
         for key in self.audio_keys:

@@ -14,7 +14,7 @@ from torchvision.models import ResNet
 
 from lerobot_playbyear.compat import BasicBlock
 from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads, weights_of
-from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig, segment_and_hop
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
 from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
 from lerobot_playbyear.policy.optimization import HAS_512_BITS
@@ -24,6 +24,7 @@ from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
 _ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
+_NEARER = 1.0  # [10 dB] by which the arm's own sound is louder than at the reference microphone
 _SHARPNESS = 4.0  # a choice among frames is learned in as few updates as the rest
 
 
@@ -45,9 +46,17 @@ class PlaybyearNetwork(nn.Module):
             grid = (config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins)
             self.spectrogram = nn.ModuleDict()
             self.hearing = nn.ModuleDict()
-            for name in map(_module_name, config.audio_keys):
-                self.hearing[name] = make_encoder("audio_encoder", config)
-                if not getattr(self.hearing[name], "hears_waveform", False) or config.audio_envelope_gain:
+            for key in config.audio_keys:
+                encoder, name = make_encoder("audio_encoder", config), _module_name(key)
+                hears_waveform = getattr(encoder, "hears_waveform", False)
+                if hears_waveform and config.reference_key:
+                    raise ValueError(
+                        f"--policy.audio_encoder={config.audio_encoder} hears the waveform, and "
+                        "--policy.reference_microphone takes noise out of spectrograms: leave one of the two out."
+                    )
+                if key != config.reference_key:
+                    self.hearing[name] = encoder
+                if not hears_waveform or config.audio_envelope_gain:
                     self.spectrogram[name] = LogSpectrogram(*grid, config.spectrogram_momentum)
             self.disturb = SoundAugmentation(config)
             n_columns = config.n_segments if config.audio_envelope_gain else 0
@@ -89,49 +98,55 @@ class PlaybyearNetwork(nn.Module):
         return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
     def _hear_all(self, batch: dict[str, Tensor], n_frames: int) -> list[Tensor]:
-        """Every microphone's embeddings: in training all are in the same room."""
-        n_heard, keys = n_frames + self.config.audio_frames - 1, self.config.audio_keys
-        sounds = [newest(batch, key, n_heard, self.config.feature_shape(key)) for key in keys]  # (B, n_heard, S) each
+        """Embeddings of every microphone but the reference, (B * n, embedding size); in training all are in the same room."""
+        config = self.config
+        n_heard, keys = n_frames + config.audio_frames - 1, config.audio_keys
+        sounds = [newest(batch, key, n_heard, config.feature_shape(key)) for key in keys]  # (B, n_heard, S) each
         waves = [to_float_wave(sound.flatten(1), key) for sound, key in zip(sounds, keys, strict=True)]
         colours: list[Tensor | None] = [None] * len(keys)
         if self.training:
             noisy, colour = self.disturb(torch.stack(waves, dim=1))  # (B, microphones, n_heard * S)
             waves, colours = list(noisy.unbind(1)), colours if colour is None else list(colour.unbind(1))
-        heard = zip(keys, waves, colours, strict=True)
-        return [self._hear(batch, key, n_frames, wave, colour) for key, wave, colour in heard]
-
-    def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int, wave: Tensor, colour: Tensor | None) -> Tensor:
-        """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` also its columns' means.
-
-        Args:
-            batch: Says where the episode had not begun.
-            key: The microphone's.
-            n_frames: How many are encoded, n.
-            wave: What it heard, (B, n_heard * S).
-            colour: Gains of another microphone, (B, bins) [10 dB].
-        """
-        config = self.config
-        n_heard = n_frames + config.audio_frames - 1
-        n_samples = wave.shape[1] // n_heard
-        begun = torch.ones_like(wave, dtype=torch.bool)  # (B, n_heard * S)
+        n_samples = sounds[0].shape[2]
+        begun = torch.ones_like(waves[0], dtype=torch.bool)  # (B, n_heard * S)
         is_pad = before_episode(batch, n_heard)  # (B, n_heard)
         if is_pad is not None:
             begun = ~is_pad.repeat_interleave(n_samples, dim=1)
-        encoder = self.hearing[_module_name(key)]
-        levels = None
-        if _module_name(key) in self.spectrogram:
-            spectrogram = self.spectrogram[_module_name(key)]
-            assert isinstance(spectrogram, LogSpectrogram)
-            # Neighbouring windows overlap: their segments are computed once.
-            shared = SharedStretches(n_frames, n_samples, config.window_samples, spectrogram.hop)
-            if colour is not None:
-                colour = colour.repeat_interleave(shared.n_stretches, dim=0)  # (B * n_stretches, bins)
-            # (B * n_stretches, bins, columns)
-            levels = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
+        _, hop = segment_and_hop(config.sample_rate or 0, config.segment_s, config.hop_s)
+        # Neighbouring windows overlap: their segments are computed once.
+        shared = SharedStretches(n_frames, n_samples, config.window_samples, hop)
+        levels: dict[str, Tensor] = {}  # (B * n_stretches, bins, columns) each
+        for key, wave, colour in zip(keys, waves, colours, strict=True):
+            if _module_name(key) in self.spectrogram:
+                if colour is not None:  # (B, bins)
+                    colour = colour.repeat_interleave(shared.n_stretches, dim=0)
+                spectrogram = self.spectrogram[_module_name(key)]
+                levels[key] = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
+        if config.reference_key is not None:
+            levels = self._own(levels, config.reference_key)
+        heard = {key: wave * begun for key, wave in zip(keys, waves, strict=True) if key != config.reference_key}
+        return [self._hear(key, shared, wave, levels.get(key)) for key, wave in heard.items()]
+
+    def _own(self, levels: dict[str, Tensor], reference: str) -> dict[str, Tensor]:
+        """Spectrograms, with the average wherever the reference microphone hears as much, each above its own mean."""
+        deviation = {key: self.spectrogram[_module_name(key)].get_buffer("variance").sqrt() for key in levels}
+        above = {key: level.detach() * deviation[key][:, None] for key, level in levels.items()}  # [10 dB]
+        return {key: level * (above[key] > above[reference] + _NEARER) for key, level in levels.items()}
+
+    def _hear(self, key: str, shared: SharedStretches, wave: Tensor, levels: Tensor | None) -> Tensor:
+        """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` also its columns' means.
+
+        Args:
+            key: The microphone's.
+            shared: The windows' stretches.
+            wave: What it heard, (B, n_heard * S), 0 where the episode had not begun.
+            levels: Its spectrogram, (B * n_stretches, bins, columns).
+        """
+        config, encoder = self.config, self.hearing[_module_name(key)]
         n_columns = getattr(encoder, "window_columns", None)
         if getattr(encoder, "hears_waveform", False):
-            start = wave.shape[1] - config.window_samples - (n_frames - 1) * n_samples
-            windows = (wave * begun)[:, start:].unfold(1, config.window_samples, n_samples)  # (B, n, samples)
+            start = wave.shape[1] - shared.length - (shared.n_windows - 1) * shared.step
+            windows = wave[:, start:].unfold(1, shared.length, shared.step)  # (B, n, samples)
             embeddings = encoder(windows.flatten(0, 1))
         elif isinstance(n_columns, int):  # convolutional along time: embeddings overlap, too
             assert levels is not None

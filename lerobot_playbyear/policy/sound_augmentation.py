@@ -24,7 +24,7 @@ _HUM_DB = (-20.0, 0.0)  # relative to the broadband noise
 _ROOM_SHARE = 0.75  # of the items that hear a room with people in it
 _RECORDED_SHARE = 0.5  # of those, if there are recordings: the others hear what is generated
 _ROOM_DB = -6.0  # of the faintest relative to an item's noise floor, and of the loudest to `audio_noise_db`
-_FARTHER_DB = 12.0  # at most, from the microphone that hears it best to another one
+_FARTHER_DB = 6.0  # at most, from the microphone that hears it best to another one
 _ENDINGS = (".wav", ".flac")  # of files with recorded noise
 _MOST_SECONDS = 7200  # of all recordings
 _SILENCE = 1e-5  # root mean square
@@ -48,6 +48,7 @@ class SoundAugmentation(nn.Module):
         assert config.sample_rate is not None
         self.sample_rate, self.max_db = config.sample_rate, config.audio_noise_db
         self.files, self.has_generated = config.audio_noise_files, config.audio_room_noise
+        self.has_reference = config.reference_key is not None
         self.highest_hz = (config.n_frequency_bins + _LEAKAGE) / config.segment_s
         self.generated = GeneratedNoise()
         self._recorded: RecordedNoise | None = None
@@ -86,7 +87,10 @@ class SoundAugmentation(nn.Module):
 
     def colour(self, n_items: int, n_microphones: int) -> Tensor:
         """A microphone's gain in every bin of the spectrogram, a smooth curve, (B, M, bins) [10 dB]."""
-        points = torch.randn(n_items, n_microphones, _COLOUR_POINTS, device=self.response.device)
+        n_drawn = 1 if self.has_reference else n_microphones  # what differs between two is in their means
+        points = torch.randn(n_items, n_drawn, _COLOUR_POINTS, device=self.response.device).expand(
+            -1, n_microphones, -1
+        )
         return _COLOUR_DB / 10 * points @ self.response.T
 
     def _own(self, max_db: float, n_items: int, n_microphones: int, n: int, n_bins: int) -> Tensor:
@@ -98,7 +102,8 @@ class SoundAugmentation(nn.Module):
         noise to as loud. Levels are those of all frequencies, also of those that the policy does not hear.
         """
         device = self.response.device
-        draws = torch.rand(4, n_items, n_microphones, 1, device=device)
+        n_drawn = 1 if self.has_reference else n_microphones  # a room's background is as loud at both
+        draws = torch.rand(4, n_items, n_drawn, 1, device=device).expand(-1, -1, n_microphones, -1)
         ranges = zip(((_FAINTEST_DB, max_db), _NOISE_TILT, _HUM_HZ, _HUM_DB), draws, strict=True)
         level, tilt, pitch, hum = (low + (high - low) * draw for (low, high), draw in ranges)
         resolution = self.sample_rate / n  # [Hz] of a bin

@@ -199,8 +199,9 @@ class Plan:
     @cached_property
     def cells(self) -> list[Cell]:
         """In the plan's order: seed by seed, so that what comes first says something of everything."""
-        seeds = self.text["sizes"][self.size]["seeds"]
-        return [cell for number, seed in enumerate(seeds) for cell in self._cells_of(int(seed), number == 0)]
+        usual, studies = self.text["sizes"][self.size]["seeds"], self.text["studies"].values()
+        seeds = sorted({*usual, *(seed for study in studies for seed in study.get("seeds", []))})
+        return [cell for seed in seeds for cell in self._cells_of(int(seed), seed == seeds[0])]
 
     def chosen(self, only: str | None) -> list[Cell]:
         """The cells that are asked for.
@@ -228,7 +229,7 @@ class Plan:
     def _cells_of(self, seed: int, is_first: bool) -> Iterator[Cell]:
         size = self.text["sizes"][self.size]
         for study, content in self.text["studies"].items():
-            if self.size not in content.get("sizes", [self.size]):
+            if self.size not in content.get("sizes", [self.size]) or seed not in content.get("seeds", size["seeds"]):
                 continue
             shared = (self.text["seeds"], self.text["defaults"], size, content.get("values", {}))
             for task, of_task in content["tasks"].items():
