@@ -113,7 +113,8 @@ class MicrophonePicturesToAudioStep(SoundStep):
             raise InputError(
                 f"This policy hears '{name}', and there is neither '{key}' nor a camera '{name}' in the observation; the "
                 f"cameras are {', '.join(cameras) or 'none'}. On a robot give the microphone that name: "
-                f"--robot.cameras='{{{name}: {{type: microphone, device: ...}}}}' (playbyear-find-microphones prints it)."
+                f"--robot.cameras='{{{name}: {{type: microphone, device: ...}}}}' (playbyear-find-microphones prints it); in "
+                "a simulation name all that the policy hears, --env.microphones='[...]'."
             )
         pictures = picture if picture.ndim == 4 else picture[None]  # (B, 3, H, W)
         blocks = [self._block(key, number, self._strip(key, one)) for number, one in enumerate(pictures)]
