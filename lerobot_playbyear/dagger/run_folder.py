@@ -259,11 +259,10 @@ class RunFolder:
             return
         named = {LAST_CHECKPOINT_LINK: state.checkpoint, BEST_LINK: state.best.get("checkpoint")}
         for name, checkpoint in named.items():
-            if checkpoint is None:
-                if (self.checkpoints / name).is_symlink():
-                    (self.checkpoints / name).unlink()
-                continue
-            replace_link(self.checkpoints / name, checkpoint)
+            if checkpoint is not None:
+                replace_link(self.checkpoints / name, checkpoint)
+            elif (self.checkpoints / name).is_symlink():
+                (self.checkpoints / name).unlink()
         wanted = {*state.milestones, *named.values()}
         for name in [name for name in state.made if name not in wanted]:
             shutil.rmtree(self.checkpoints / name, ignore_errors=True)  # not where it is a link
