@@ -115,8 +115,7 @@ class DurableWriter:
                     "before it are complete."
                 )
         except BaseException as error:
-            if self._lock is not None:
-                self._lock.close()
+            self.close()
             if isinstance(error, OSError) and not isinstance(error, FileExistsError):
                 raise DatasetWriteError(f"Cannot write to {self.root}: {error.strerror or error}.") from error
             raise
