@@ -21,6 +21,9 @@ Row = dict[str, Any]
 KEY = ("study", "task", "variant", "seed", "size")
 """What a row is about; there is one of each."""
 
+N_BEST = 3
+"""Checkpoints that were best on the seeds of choice, and are evaluated on held-out ones."""
+
 _KINDS: Row = {
     **dict.fromkeys(("successes", "acted_early"), str),
     **dict.fromkeys(("best", "groups", "versions"), (dict, str)),
