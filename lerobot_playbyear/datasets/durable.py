@@ -148,9 +148,8 @@ class DurableWriter:
                 yet.
         """
         if self._is_complete:
-            raise DatasetWriteError(
-                f"Episode {self.num_episodes} is not saved yet: call save_episode again, or discard_episode."
-            )
+            index = self.num_episodes
+            raise DatasetWriteError(f"Episode {index} is not saved yet: call save_episode again, or discard_episode.")
         check_frame(frame, self._info.features)
         self._check_memory()
         self._frames.append({key: self._kept(key, value) for key, value in frame.items()})

@@ -78,9 +78,7 @@ class Table:
         """
         theirs, known = other.rows(), {key_of(row) for row in self.rows()}
         if not theirs:
-            raise InputError(
-                f"{other.folder} holds no rows: give a folder of STUDY.jsonl that playbyear-reproduce wrote."
-            )
+            raise InputError(f"{other.folder} holds no rows: give a folder of STUDY.jsonl from playbyear-reproduce.")
         new = [row for row in theirs if key_of(row) not in known]
         self.put(new)
         return len(new)
