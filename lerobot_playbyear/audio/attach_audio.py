@@ -280,9 +280,7 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     try:
         values = parse_json(cfg.offsets.read_bytes())
         if not isinstance(values, list) or not np.isfinite(values).all():
-            raise ValueError(
-                f"it holds {printable(str(values)[:40])}; wanted [0.5, 1.2, ...], seconds for each episode"
-            )
+            raise ValueError(f"it holds {printable(str(values)[:40])}; wanted [0.5, 1.2, ...], seconds by episode")
         values = [float(value) for value in values]
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"--offsets={cfg.offsets} is not a list of numbers in JSON: {error}") from error
@@ -352,9 +350,7 @@ def _files(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], _: P
         try:
             return str(Path(pattern.format(episode=episode)))
         except (LookupError, ValueError, AttributeError, TypeError) as error:
-            raise InputError(
-                f"--files={pattern} cannot be filled in: {error}. Only {{episode}} may be in it."
-            ) from error
+            raise InputError(f"--files={pattern} cannot be filled in: {error}. It takes {{episode}} alone.") from error
 
     def recording(episode: int) -> Recording:
         samples, rate = read_audio(path_of(episode))
@@ -406,9 +402,8 @@ def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
         )
     missing = [episode for episode in range(n_episodes) if episode not in known]
     if missing:
-        raise InputError(
-            f"{source} has no time for {name_episodes(missing)}; the dataset has {n_episodes} episodes. Add it."
-        )
+        lacking = name_episodes(missing)
+        raise InputError(f"{source} has no time for {lacking}; the dataset has {n_episodes} episodes. Add it.")
     return [known[episode] for episode in range(n_episodes)]
 
 

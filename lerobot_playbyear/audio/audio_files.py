@@ -80,9 +80,7 @@ def audio_pieces(path: str | Path) -> Iterator[tuple[np.ndarray, int]]:
                 raise AudioFileError(f"{path} holds no sound.")
             sound: Any = container.streams.audio[0]
             if sound.codec_context is None:
-                raise AudioFileError(
-                    f"{path} holds sound of a coding that FFmpeg does not know: convert it to WAV or FLAC."
-                )
+                raise AudioFileError(f"{path} holds sound that FFmpeg cannot decode: convert it to WAV or FLAC.")
             rate, begin = sound.rate, _begin(container)
             if not 0 < rate <= _MOST_HZ:
                 says = f"says that it has {rate} samples per second; wanted 1 to {_MOST_HZ:,}"
@@ -107,9 +105,7 @@ def audio_pieces(path: str | Path) -> Iterator[tuple[np.ndarray, int]]:
             raise
         if not position or isinstance(error, OSError):
             raise AudioFileError(f"The sound of {path} cannot be decoded: {error}.") from error
-        logger.warning(
-            "%s is damaged or cut off after %.3f s (%s): what comes later is lost.", path, position / rate, error
-        )
+        logger.warning("%s is damaged or cut off after %.3f s (%s): the rest is lost.", path, position / rate, error)
     if not position:
         raise AudioFileError(f"{path} holds no samples.")
 
@@ -146,9 +142,7 @@ class _WholeSamples(io.FileIO):
     def _look(self) -> None:
         form, _, kind = struct.unpack("<4sI4s", self.read(12))
         if form == b"RIFX" and kind == b"WAVE":
-            raise AudioFileError(
-                f"{self.name} is a WAV file of big-endian numbers (RIFX), which FFmpeg misreads: convert it."
-            )
+            raise AudioFileError(f"{self.name} holds big-endian numbers (RIFX), which FFmpeg misreads: convert it.")
         if form not in (b"RIFF", b"RF64") or kind != b"WAVE":
             return
         for _ in range(_MOST_CHUNKS):
@@ -180,14 +174,11 @@ class _WholeSamples(io.FileIO):
 
 def _begin(container: av.container.InputContainer) -> float | None:
     """When a file begins, by its own clock [s]: with its first picture, or its earliest sound; None: with the first read."""
-    streams: list[Any] = [
-        each for each in container.streams.video if not each.disposition & av.stream.Disposition.attached_pic
-    ]
+    cover = av.stream.Disposition.attached_pic
+    streams: list[Any] = [each for each in container.streams.video if not each.disposition & cover]
     streams = streams or ([*container.streams.audio] if len(container.streams.audio) > 1 else [])
-    starts = [
-        float(each.start_time * each.time_base) for each in streams if each.start_time is not None and each.time_base
-    ]
-    return min(starts, default=None)
+    timed = [each for each in streams if each.start_time is not None and each.time_base]
+    return min((float(each.start_time * each.time_base) for each in timed), default=None)
 
 
 def _warn_of_delay(path: Path, container: av.container.InputContainer) -> None:

@@ -78,9 +78,8 @@ def read_camera_sound(cfg: AttachAudioConfig, dataset: DatasetReader, scratch: P
         columns, starts = _MicrophoneReader(cfg, dataset, key, scratch).read()
         added.update(columns)
         is_first = [own | other for own, other in zip(is_first, starts, strict=True)]
-    for flags, before, by_person in zip(
-        is_first, _flags(dataset, IS_FIRST), _flags(dataset, INTERVENTION), strict=True
-    ):
+    known = (_flags(dataset, key) for key in (IS_FIRST, INTERVENTION))
+    for flags, before, by_person in zip(is_first, *known, strict=True):
         flags |= before  # LeRobot's rollout resets the policy at every hand-back, too, however short the pause
         flags[1:] |= by_person[:-1] & ~by_person[1:]
     stats = [numeric_stats({IS_FIRST: flags[:, None]}, {IS_FIRST: IS_FIRST_FEATURE})[IS_FIRST] for flags in is_first]
@@ -198,9 +197,7 @@ class _MicrophoneReader:
             if path is None:
                 where = f"is not in {' or '.join(map(str, self._folders))}" if self._folders else "has to be named"
                 if self._is_foreign:
-                    where += (
-                        f", for this dataset came from the Hub and may be a stranger's (your own are in {SESSIONS})"
-                    )
+                    where += f", for this dataset came from the Hub and may be a stranger's (yours are in {SESSIONS})"
                 raise ValueError(
                     f"its pictures were compressed, and the session's file *_{session:08x}.wav {where}. Copy it from the "
                     "machine that recorded, and give --session=FOLDER"

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_stats
 from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.features import Features
+from lerobot_playbyear.datasets.features import Features, arrow_schema
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, list_files, new_folder
 from lerobot_playbyear.datasets.info import DOWNLOADED, STATS_PATH, came_from_the_hub, read_info
 from lerobot_playbyear.datasets.parquet import (
@@ -88,8 +87,7 @@ def _write_files(root: Path, target: Path, added: Columns, removed: Collection[s
     info["features"] = {**own, **{key: dict(column.feature) for key, column in added.items()}, **features}
     if removed:
         info = {name: value for name, value in info.items() if name not in ("audio_path", "audio_files_size_in_mb")}
-    shaped = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in info["features"].items()}
-    schema = get_hf_features_from_features(shaped).arrow_schema
+    schema = arrow_schema(info["features"])
     episodes = [dict(zip(added, own, strict=True)) for own in zip(*(a.stats for a in added.values()), strict=True)]
     named = named_pictures(root, map(DataFile, list_files(root, _DATA)), features)
     names = [path.relative_to(root) for path in entries_below(root) if path.is_file()]

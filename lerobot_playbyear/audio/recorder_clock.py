@@ -138,9 +138,8 @@ def _from_table(path: Path) -> dict[int, float]:
     short = [line for line in lines if len(line) < 2 or (separator == "," and any(line[2:]))]  # 0,7,5 may be 7.5
     if short:
         raise ClockError(f"{path}: a line is {','.join(short[0])!r}; wanted episode and seconds, such as 0,12.5.")
-    if separator == "\t" and all(
-        len(line) > 2 and "." in line[0] for line in lines
-    ):  # labels: no episode's number has a point
+    # Labels: no episode's number has a point.
+    if separator == "\t" and all(len(line) > 2 and "." in line[0] for line in lines):
         return _numbered(path, [(episode, line[0]) for episode, line in enumerate(lines)])
     return _numbered(path, [(line[0], line[1]) for line in lines])
 

@@ -17,7 +17,6 @@ from lerobot_playbyear.compat import get_step_identifier
 from lerobot_playbyear.dagger.batches import BalancedBatches
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
-from lerobot_playbyear.dagger.methods import Method
 from lerobot_playbyear.dagger.report import Report, attempt_figures, round_figures
 from lerobot_playbyear.dagger.run_folder import RunFolder, RunState
 from lerobot_playbyear.datasets.errors import InputError
@@ -59,7 +58,6 @@ class Loop:
         batches: Draws from both.
         report: Tells how it goes.
         scene: Where attempts happen; None to learn from recorded corrections alone.
-        method: How attempts are made, kept and learned from.
     """
 
     cfg: DaggerConfig
@@ -73,7 +71,6 @@ class Loop:
     batches: BalancedBatches
     report: Report
     scene: Scene | None
-    method: Method
 
     def run(self) -> None:
         """Go on until the run is complete, or until the policy needs the expert no more.
@@ -82,7 +79,7 @@ class Loop:
             PlaybyearError: No attempt succeeds even with the expert, the training diverges, or something cannot be written.
         """
         if self.scene is not None:
-            self.method.begin(self)
+            self.cfg.method.begin(self)
             self._note_unnoted_attempt()
         self._evaluate_if_due()
         while not self._is_complete():
@@ -114,7 +111,7 @@ class Loop:
                 "something else changed it. Begin a new run in another --output_dir; it may append to the same dataset."
             )
         figures, by_expert = self.corrections.last()
-        self.method.note_recovered()
+        self.cfg.method.note_recovered()
         figures |= {"outcome": "kept", **self._cost(by_expert), "recovered": True}
         state.fruitless.clear()
         self._count(figures)
@@ -125,9 +122,9 @@ class Loop:
         fruitless = self.state.fruitless
         while len(fruitless) < self.cfg.max_attempts or self.state.to_show is not None:
             self.report.doing("acting")
-            spent, is_alone = Seconds(), self.method.is_alone
+            spent, is_alone = Seconds(), self.cfg.method.is_alone
             episode = self._attempt(spent)
-            outcome = self.method.outcome(episode)
+            outcome = self.cfg.method.outcome(episode)
             if outcome == "kept":
                 fruitless.clear()
                 with spent.of("episode_saving"):
@@ -174,14 +171,14 @@ class Loop:
         state = self.state
         while state.next_seed in self.cfg.eval_seeds:
             state.next_seed += 1
-        self.method.prepare(demonstrates=state.to_show is not None)
+        self.cfg.method.prepare(demonstrates=state.to_show is not None)
         seed = state.next_seed if state.to_show is None else state.to_show
         set_seed(self._random_seed(_ATTEMPT, seed))
         return play(self.scene.env, self.scene.actor, seed, expert=self.scene.expert, seconds=spent)
 
     def _note(self, episode: Episode, outcome: str, spent: Seconds) -> None:
         assert episode.interventions is not None
-        self.method.note(episode, outcome)
+        self.cfg.method.note(episode, outcome)
         figures = {"seed": episode.seed, "n_frames": len(episode), "success": episode.success, "outcome": outcome}
         self._count(figures | self._cost(episode.interventions) | _rounded(spent))
 
@@ -193,7 +190,7 @@ class Loop:
         is_by_person = self.scene is not None and self.scene.expert.decides
         is_repeated = outcome == "discarded" and is_by_person
         state.next_seed = figures["seed"] + (not is_repeated)
-        is_to_show = outcome == "failed" and self.method.shows_failures and state.to_show is None
+        is_to_show = outcome == "failed" and self.cfg.method.shows_failures and state.to_show is None
         state.to_show = figures["seed"] if is_to_show else None
         self.report.write("attempt", figures)
         self.folder.commit(state)

@@ -127,7 +127,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     stack.callback(method.close)
     corrections = Corrections(cfg.interventions)
     stack.callback(corrections.close)
-    env = None
+    env = scene = None
     if cfg.is_online and cfg.env is not None:
         env = env_spec(cfg.env).make()
         stack.callback(env.close)
@@ -148,6 +148,8 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         _forget_all(learner, cfg.seed)
     if env is not None and cfg.env is not None:
         corrections.open_for_writing(fps, features, cfg.env.type)
+        processors = (learner.preprocessor, learner.postprocessor)
+        scene = Scene(env, PolicyActor(learner.unwrapped, cfg.env, *processors, learner.accelerator.autocast), expert)
     if state.first_episodes is None:
         state.first_episodes = corrections.n_episodes
         state.next_seed = next_seed(cfg.interventions.folder, cfg.episode_seed) if cfg.is_online else 0
@@ -166,14 +168,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
 
     folder.begin(cfg, state)
     report = stack.enter_context(Report(cfg, training, folder, state))
-    scene = None
-    if env is not None and cfg.env is not None:
-        processors = (learner.preprocessor, learner.postprocessor)
-        actor = PolicyActor(learner.unwrapped, cfg.env, *processors, learner.accelerator.autocast)
-        scene = Scene(env, actor, expert)
-    return Loop(
-        cfg, training, folder, state, learner, windows, demonstrations, corrections, batches, report, scene, method
-    )
+    return Loop(cfg, training, folder, state, learner, windows, demonstrations, corrections, batches, report, scene)
 
 
 @torch.no_grad()

@@ -176,9 +176,7 @@ class RunFolder:
                 f"--output_dir={self.path} holds files, but no run of playbyear-dagger (no {CONFIG_NAME}): choose another."
             )
         if not resume:
-            raise InputError(
-                f"--output_dir={self.path} holds a run already: go on with it with --resume=true, or choose another."
-            )
+            raise InputError(f"--output_dir={self.path} holds a run already: give --resume=true, or choose another.")
         path = self.path / STATE_NAME
         if not path.is_file():
             if self.metrics() or self.checkpoints.exists():  # the state is written before them
@@ -197,9 +195,7 @@ class RunFolder:
             ) from error
         said = [*state.made, *state.milestones, state.checkpoint, state.best.get("checkpoint")]
         if strange := [name for name in said if name is not None and not _NAME.fullmatch(name)]:
-            raise InputError(
-                f"{path} names the checkpoint {strange[0]!r}; wanted names of folders in '{self.checkpoints}'."
-            )
+            raise InputError(f"{path} names the checkpoint {strange[0]!r}; wanted folders in '{self.checkpoints}'.")
         return state
 
     def begin(self, cfg: DaggerConfig, state: RunState) -> None:
@@ -259,11 +255,10 @@ class RunFolder:
             return
         named = {LAST_CHECKPOINT_LINK: state.checkpoint, BEST_LINK: state.best.get("checkpoint")}
         for name, checkpoint in named.items():
-            if checkpoint is None:
-                if (self.checkpoints / name).is_symlink():
-                    (self.checkpoints / name).unlink()
-                continue
-            replace_link(self.checkpoints / name, checkpoint)
+            if checkpoint is not None:
+                replace_link(self.checkpoints / name, checkpoint)
+            elif (self.checkpoints / name).is_symlink():
+                (self.checkpoints / name).unlink()
         wanted = {*state.milestones, *named.values()}
         for name in [name for name in state.made if name not in wanted]:
             shutil.rmtree(self.checkpoints / name, ignore_errors=True)  # not where it is a link

@@ -43,9 +43,7 @@ def check_steps(path: str | Path, revision: str | None = None) -> None:
     """
     for file in entries_below(Path(path)) if Path(path).is_dir() else ():
         if is_special(file):
-            raise InputError(
-                f"'{file}' is a pipe or a device; nothing was loaded. Copy the checkpoint again, with its files."
-            )
+            raise InputError(f"'{file}' is a pipe or a device; nothing was loaded. Copy the checkpoint again.")
     for name in PROCESSORS:
         file = Path(path) / name
         if not Path(path).is_dir():

@@ -115,8 +115,7 @@ class DurableWriter:
                     "before it are complete."
                 )
         except BaseException as error:
-            if self._lock is not None:
-                self._lock.close()
+            self.close()
             if isinstance(error, OSError) and not isinstance(error, FileExistsError):
                 raise DatasetWriteError(f"Cannot write to {self.root}: {error.strerror or error}.") from error
             raise
@@ -149,9 +148,8 @@ class DurableWriter:
                 yet.
         """
         if self._is_complete:
-            raise DatasetWriteError(
-                f"Episode {self.num_episodes} is not saved yet: call save_episode again, or discard_episode."
-            )
+            index = self.num_episodes
+            raise DatasetWriteError(f"Episode {index} is not saved yet: call save_episode again, or discard_episode.")
         check_frame(frame, self._info.features)
         self._check_memory()
         self._frames.append({key: self._kept(key, value) for key, value in frame.items()})

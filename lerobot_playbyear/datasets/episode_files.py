@@ -17,13 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.configs import RGBEncoderConfig, depth_encoder_defaults
 from lerobot.datasets.compute_stats import sample_indices
-from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_stats, load_tasks, write_info, write_tasks
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DEFAULT_TASKS_PATH, DatasetInfo, update_chunk_file_indices
 from lerobot.datasets.video_utils import encode_video_frames, get_video_duration_in_s, get_video_info
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from lerobot_playbyear.datasets.features import Features, is_depth
+from lerobot_playbyear.datasets.features import Features, arrow_schema, is_depth
 from lerobot_playbyear.datasets.files import EPISODES_DIR, is_listed, list_files
 from lerobot_playbyear.datasets.frame_rate import exact_rate
 from lerobot_playbyear.datasets.journal import STAGING, remove_staged
@@ -127,7 +126,7 @@ def _place(root: Path, template: str, last: Mapping[str, Any], prefix: str, chun
 
 def _stage_data(root: Path, info: DatasetInfo, columns: Mapping[str, Any], last: Mapping[str, Any]) -> dict[str, int]:
     """Writes an episode's frames, behind those of the last small file. Returns where."""
-    schema = get_hf_features_from_features(info.features).arrow_schema
+    schema = arrow_schema(info.features)
     arrays = [_arrow_column(columns[name], schema.field(name).type, info.features[name]) for name in schema.names]
     name, place = _place(root, info.data_path, last, "data", info.chunks_size)
     before = []

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.frame_rate import divides, exact_rate, nearest_sample_rate
@@ -137,6 +138,14 @@ def _check_one(key: str, feature: Mapping[str, Any], fps: float) -> int:
             f"{wanted}. Correct the sample rate in meta/info.json, or record again."
         )
     return int(sample_rate)
+
+
+def arrow_schema(features: Features) -> pa.Schema:
+    """The columns of a dataset's data files, as LeRobot makes them. Raises whatever LeRobot does of a feature that it lacks."""
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    shaped = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in features.items()}
+    return get_hf_features_from_features(shaped).arrow_schema
 
 
 def episode_waveform(dataset: "LeRobotDataset", episode: int, key: str) -> tuple[np.ndarray, int]:
@@ -298,11 +307,8 @@ def _check_shape(key: str, feature: Mapping[str, Any]) -> None:
 
 def _check_type(key: str, feature: Mapping[str, Any]) -> None:
     """Whether LeRobot's files can hold a feature that is no sound."""
-    from lerobot.datasets.feature_utils import get_hf_features_from_features
-
-    own = {key: {**feature, "shape": tuple(feature["shape"])}}
     try:
-        get_hf_features_from_features(own).arrow_schema  # noqa: B018  (raises for what it does not know)
+        arrow_schema({key: feature})
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"'{key}' has dtype {feature['dtype']!r} and shape {feature['shape']!r}, which no dataset can hold: {error}"

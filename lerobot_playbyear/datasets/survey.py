@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
 from lerobot_playbyear.datasets.errors import InputError, printable
-from lerobot_playbyear.datasets.features import AUDIO_DTYPE, audio_keys, check_audio_features
+from lerobot_playbyear.datasets.features import AUDIO_DTYPE, arrow_schema, audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, naming
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
 from lerobot_playbyear.datasets.info import (
@@ -30,14 +30,7 @@ from lerobot_playbyear.datasets.info import (
     parse_stats,
     read_info,
 )
-from lerobot_playbyear.datasets.parquet import (
-    DataFile,
-    ParquetDamageError,
-    are_alike,
-    column_to_numpy,
-    parsing,
-    read_table,
-)
+from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, are_alike, column_to_numpy, read_table
 from lerobot_playbyear.datasets.pictures import open_picture
 from lerobot_playbyear.datasets.remedies import repair_command, task_command
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
@@ -212,12 +205,9 @@ def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[s
 
 
 def _schema(root: Path, info: Info) -> pa.Schema:
-    from lerobot.datasets.feature_utils import get_hf_features_from_features
-
     in_rows = {key: feature for key, feature in info["features"].items() if feature["dtype"] != AUDIO_DTYPE}
-    features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in in_rows.items()}
     try:
-        return get_hf_features_from_features(features).arrow_schema
+        return arrow_schema(in_rows)
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise DatasetDamagedError(f"{root / INFO_PATH}: LeRobot knows no such feature: {error}. Correct it.") from error
 
@@ -275,7 +265,7 @@ def _read_frames(root: Path, file: DataFile, info: Info, thorough: bool, finding
             continue
         parts.append({**part, "row": first + np.arange(len(table))})
         for key in cameras:
-            for row, problem in _damaged_pictures(root, table.column(key), key, info["features"][key]):
+            for row, problem in _damaged_pictures(root, table, key, info["features"][key]):
                 spoilt[first + row] = f"a picture of '{key}' {problem}"
     if not parts:
         return
@@ -303,11 +293,9 @@ def _read_frames(root: Path, file: DataFile, info: Info, thorough: bool, finding
         )
 
 
-def _damaged_pictures(
-    root: Path, column: pa.ChunkedArray, key: str, feature: Mapping[str, Any]
-) -> Iterator[tuple[int, str]]:
-    """Of every damaged picture in a column its row, and what is wrong with it. Those in files of their own stay there."""
-    for row, picture in enumerate(value.as_py() for value in column):
+def _damaged_pictures(root: Path, table: pa.Table, key: str, feature: Mapping[str, Any]) -> Iterator[tuple[int, str]]:
+    """Of every damaged picture of a camera its row, and what is wrong with it. Those in files of their own stay there."""
+    for row, picture in enumerate(value.as_py() for value in table.column(key)):
         try:
             if picture["bytes"] is not None:
                 with open_picture(picture, root, key, feature) as image:
@@ -522,13 +510,9 @@ def _tasks_in_table(root: Path) -> tuple[dict[int, str], str | None]:
     path = root / TASKS_PATH
     if not is_listed(root, TASKS_PATH):
         return {}, "is missing"
-    import pandas as pd
-
     try:
-        read_table(path)  # with checksums, and if there is room
-        with parsing(path):
-            table = pd.read_parquet(path)  # as LeRobot does: it is told twice what the columns are
+        table = read_table(path).to_pandas()  # LeRobot's way: the file says twice what the columns are
         known = dict(zip(table["task_index"].astype(int).tolist(), table.index.astype(str), strict=True))
-    except (LookupError, ValueError, TypeError, OverflowError) as error:
+    except (pa.ArrowException, LookupError, ValueError, TypeError, OverflowError) as error:
         return {}, f"cannot be read ({error})"
     return known, None if list(known) == list(range(len(known))) else "does not number its tasks from 0 on"

@@ -80,9 +80,7 @@ def env_facts(env: gym.Env) -> EnvFacts:
         raise RolloutError(f"The action space must be a Box, but it is {env.action_space}.")
     fps = frame_rate(env.metadata.get("render_fps") or 0)
     if not isinstance(fps, int):
-        raise RolloutError(
-            f"metadata['render_fps'] is {fps}; wanted a whole number of steps per second, such as {round(fps)}."
-        )
+        raise RolloutError(f"metadata['render_fps'] is {fps}; wanted whole steps per second, such as {round(fps)}.")
     has_expert = callable(getattr(env.unwrapped, "scripted_expert", None))
     names = (getattr(env.unwrapped, name, None) for name in ("state_names", "action_names"))
     return EnvFacts(env.observation_space, env.action_space, fps, has_expert, *names)

@@ -42,9 +42,7 @@ class Script:
         owner: Any = env.unwrapped
         if self._baseline is None:
             if not callable(getattr(owner, "scripted_expert", None)):
-                raise RolloutError(
-                    f"{type(owner).__name__} has no scripted expert: a script needs `scripted_expert()`."
-                )
+                raise RolloutError(f"{type(owner).__name__} has no scripted expert: it lacks `scripted_expert()`.")
             self._script = owner.scripted_expert()
             return
         baselines = owner.blind_baselines() if hasattr(owner, "blind_baselines") else {}
@@ -126,9 +124,8 @@ class RolloutPool:
         try:
             return future.result()
         except BrokenProcessPool as error:
-            raise RolloutError(
-                "A rollout worker died (out of memory, or killed). Try fewer: num_workers=1, or 0 for none."
-            ) from error
+            said = "A rollout worker died (out of memory, or killed). Try fewer: num_workers=1, or 0 for none."
+            raise RolloutError(said) from error
 
 
 # What follows runs in a worker; the environment there is the worker's own and lives as long as it does.

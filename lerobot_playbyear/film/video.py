@@ -28,6 +28,7 @@ _MAX_GAIN = 100.0
 _SOUND_BIT_RATE = 200_000  # bits per second, of two channels
 _LOWEST_BIT_RATE = 60_000  # of the pictures
 _LIMITED_BIT_RATE = 20_000_000  # of the pictures; a film that may have more is not limited at all
+_MOST_BYTES = 2**28  # of an episode's film, about: one of hours is coarser, so that a browser can hold it
 _NOT_READ = 96  # grey level of a picture that could not be read
 _EMPTY_SIZE = 16  # pixels; the picture of an episode without cameras, which the page hides
 # Control points of a dark-to-bright colour scale whose lightness grows evenly.
@@ -129,14 +130,12 @@ def inset(picture: np.ndarray, view: np.ndarray) -> np.ndarray:
     return np.asarray(framed)
 
 
-def compose(
-    pictures: Iterable[np.ndarray], n_pictures: int, sound: np.ndarray, sample_rate: int
-) -> Iterator[np.ndarray]:
+def compose(pictures: Iterable[np.ndarray], n_frames: int, sound: np.ndarray, sample_rate: int) -> Iterator[np.ndarray]:
     """Puts each picture above the spectrogram strip, with a cursor at the picture's time.
 
     Args:
         pictures: T + 1 pictures (H, W, 3) uint8.
-        n_pictures: T + 1.
+        n_frames: T + 1.
         sound: (n, n_microphones) int16, as long as the film. The strip shows the first microphone; without a
             microphone there is no strip.
         sample_rate: [Hz].
@@ -156,7 +155,7 @@ def compose(
             top = f"{min(TOP_FREQUENCY, sample_rate // 2) / 1000:g} kHz"
             ImageDraw.Draw(labelled).text((4, 2), top, fill=(255, 255, 255))
             strip = np.asarray(labelled)
-        cursor = min(round(width * (index + 1) / n_pictures), width - 1)
+        cursor = min(round(width * (index + 1) / n_frames), width - 1)
         shown = strip.copy()
         shown[:, cursor:] = (shown[:, cursor:] * _DIMMED).astype(np.uint8)
         shown[:, max(cursor - 1, 0) : cursor + 1] = 255
@@ -255,13 +254,7 @@ def tile(
 
 
 def encode(
-    path: Path,
-    pictures: Iterator[np.ndarray],
-    n_pictures: int,
-    fps: float,
-    sound: Sequence[np.ndarray],
-    gain: float,
-    most_bytes: int = 2**28,
+    path: Path, pictures: Iterator[np.ndarray], n_pictures: int, fps: float, sound: Sequence[np.ndarray], gain: float
 ) -> Path:
     """Writes an mp4 with the sound of the first two microphones, left and right, in time with the pictures.
 
@@ -272,13 +265,11 @@ def encode(
         fps: Frames per second [Hz].
         sound: As for `film_sound`.
         gain: By how much to amplify.
-        most_bytes: About how large it may become: the film of an episode of hours is coarser, so that a browser can
-            hold it.
     """
     samples, sample_rate = film_sound(sound, n_pictures, fps, gain)
     # Key frames every second, so that stepping backwards is quick.
     options = {"crf": "23", "g": str(math.ceil(fps))}
-    bit_rate = max(round(8 * most_bytes * fps / n_pictures) - _SOUND_BIT_RATE, _LOWEST_BIT_RATE)
+    bit_rate = max(round(8 * _MOST_BYTES * fps / n_pictures) - _SOUND_BIT_RATE, _LOWEST_BIT_RATE)
     if bit_rate < _LIMITED_BIT_RATE:
         options |= {"maxrate": str(bit_rate), "bufsize": str(2 * bit_rate)}
     return write_film(path, pictures, fps, samples, sample_rate, options)

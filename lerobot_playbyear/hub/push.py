@@ -428,9 +428,7 @@ def _create(repo_id: str, kind: str, private: bool | None) -> RepoUrl:
     api = HfApi()
     repository = _patiently(lambda: api.create_repo(repo_id, repo_type=kind, private=private, exist_ok=True))
     if private and not _patiently(lambda: api.repo_info(repository.repo_id, repo_type=kind)).private:
-        raise HubError(
-            f"private=true, but {repository} is public. Make it private in its settings, or leave the option out"
-        )
+        raise HubError(f"private=true, but {repository} is public. Make it private in its settings, or drop the option")
     return repository
 
 

@@ -197,29 +197,27 @@ class OpenCard:
 
     def __init__(self, config: "MicrophoneCameraConfig", channels: int) -> None:
         self.n_users = 0
-        self.microphone = make_microphone(config, channels)
-        if self.microphone.channels < channels:
-            raise MicrophoneError(
-                f"{self.microphone.name} has {self.microphone.channels} channels, and {channels} are wanted."
-            )
-        self.recording = CardRecording(self.microphone.name, config.sample_rate, self.microphone.channels)
+        microphone = self.microphone = make_microphone(config, channels)
+        if microphone.channels < channels:
+            raise MicrophoneError(f"{microphone.name} has {microphone.channels} channels, and {channels} are wanted.")
+        self.recording = CardRecording(microphone.name, config.sample_rate, microphone.channels)
         self._step_s, self._step_counter = -math.inf, 0
         self._readers: set[int] = set()  # in this control step
         self._lock = threading.Lock()
 
-        enough = n_kept(self.microphone.sample_rate) + round(2 * CHUNK_S * self.microphone.sample_rate)
+        enough = n_kept(microphone.sample_rate) + round(2 * CHUNK_S * microphone.sample_rate)
         try:
-            self.microphone.connect(self.recording.write)
+            microphone.connect(self.recording.write)
             if not self.recording.wait_for(1, _FIRST_SOUND_S):
-                self.microphone.disconnect()
-                self.microphone.connect(self.recording.write)
+                microphone.disconnect()
+                microphone.connect(self.recording.write)
             if not self.recording.wait_for(enough, _FIRST_SOUND_S):
                 raise MicrophoneError(
-                    f"{self.microphone.name} gave no sound in {_FIRST_SOUND_S:.0f} s, even after it was opened again. Is it "
+                    f"{microphone.name} gave no sound in {_FIRST_SOUND_S:.0f} s, even after it was opened again. Is it "
                     "plugged in? Does another program use it? `playbyear-find-microphones` shows what it hears."
                 )
         except BaseException:
-            self.microphone.disconnect()
+            microphone.disconnect()
             raise
 
     def newest(self, reader: int) -> int:
@@ -251,20 +249,19 @@ def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int]) -> Open
         card = _open_cards.get(config.card) or OpenCard(config, max(channels) + 1)
         card.n_users += 1
         _open_cards[config.card] = card
+    microphone = card.microphone
     try:
-        if card.microphone.problem:
+        if microphone.problem:
+            raise MicrophoneError(f"{microphone.name} is gone: {microphone.problem}. Disconnect the others first.")
+        if microphone.sample_rate != config.sample_rate:
             raise MicrophoneError(
-                f"{card.microphone.name} is gone: {card.microphone.problem}. Disconnect the others first."
-            )
-        if card.microphone.sample_rate != config.sample_rate:
-            raise MicrophoneError(
-                f"Microphones of one card ({config.label}) have sample_rate {card.microphone.sample_rate} and "
+                f"Microphones of one card ({config.label}) have sample_rate {microphone.sample_rate} and "
                 f"{config.sample_rate}: give them the same."
             )
-        if config.channel >= card.microphone.channels:
+        if config.channel >= microphone.channels:
             raise MicrophoneError(
-                f"channel={config.channel} of a microphone ({config.label}): the card is open with "
-                f"{card.microphone.channels} channels. Make all of its microphones before one is connected."
+                f"channel={config.channel} of a microphone ({config.label}): the card is open with {microphone.channels} "
+                "channels. Make all of its microphones before one is connected."
             )
     except MicrophoneError:
         leave_card(config, card)

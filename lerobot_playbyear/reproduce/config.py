@@ -51,8 +51,6 @@ class ReproduceConfig:
             if getattr(self, name) < 1:
                 raise InputError(f"--{name}={getattr(self, name)}: give 1 or more.")
         if (self.folder is None) == (self.action == "merge"):
-            raise InputError(
-                "playbyear-reproduce merge FOLDER takes in the tables of a folder; no other action has one."
-            )
+            raise InputError("playbyear-reproduce merge FOLDER takes in a folder's tables; no other action has one.")
         if self.cluster not in (None, "local", "slurm"):
             raise InputError(f"--cluster={self.cluster}: give local or slurm, or leave it out.")

@@ -16,9 +16,8 @@ from jinja2 import Environment, StrictUndefined
 from lerobot_playbyear.datasets import markdown
 from lerobot_playbyear.datasets.files import new_file
 from lerobot_playbyear.reproduce.plan import Cell, Plan
-from lerobot_playbyear.reproduce.table import KEY, Row, Table, best_rate, key_of, mean_and_error, rate
+from lerobot_playbyear.reproduce.table import KEY, N_BEST, Row, Table, best_rate, key_of, mean_and_error, rate
 
-_N_BEST = 3
 _EXPERT = ("kept", "attempts", "steps", "takeovers", "person_minutes")
 
 Found = Sequence[tuple[Cell, Row | None]]
@@ -98,9 +97,7 @@ def _line(variant: str, rows: Sequence[Row | None], study: dict[str, Any]) -> di
         return line
     if "players" in done[0]:
         players = [(name, each) for row in done for name, each in row.get("players", {}).items()]
-        told = [
-            f"{name} ({each['kind']}) {100 * each['successes'] / each['n_episodes']:.0f} %" for name, each in players
-        ]
+        told = [f"{name} ({own['kind']}) {100 * own['successes'] / own['n_episodes']:.0f} %" for name, own in players]
         return {**line, "success": "; ".join(told)}
     curves = [sorted(rate(point["choice"]) for point in row["curve"]) for row in done if row.get("curve")]
     groups: dict[str, str] = {}
@@ -113,7 +110,7 @@ def _line(variant: str, rows: Sequence[Row | None], study: dict[str, Any]) -> di
     best = [value for value in map(best_rate, done) if value is not None]
     for name, bits in (("last", "successes"), ("early", "acted_early")):
         line[name] = [rate(row[bits]) for row in done if row.get(bits)]
-    same = [statistics.mean(curve[-_N_BEST:]) for curve in curves]
+    same = [statistics.mean(curve[-N_BEST:]) for curve in curves]
     return {**line, "success": "; ".join([_shown(best), *apart]), "same": same}
 
 

@@ -18,9 +18,8 @@ from lerobot_playbyear.datasets.files import FolderLock, FolderLockedError, pars
 from lerobot_playbyear.reproduce.config import ReproduceConfig
 from lerobot_playbyear.reproduce.plan import Candidate, Cell, Plan, Step
 from lerobot_playbyear.reproduce.steps import StepError, carry_out, forked, prepare
-from lerobot_playbyear.reproduce.table import KEY, Row, Table, machine, rate, told, versions
+from lerobot_playbyear.reproduce.table import KEY, N_BEST, Row, Table, machine, rate, told, versions
 
-_N_BEST = 3
 _DONE, _FAILED, _BUSY = 0, 1, 3
 
 
@@ -195,7 +194,7 @@ def _evaluated(cell: Cell, carry: Any) -> Row:
     there = [each for each in cell.candidates if each.path.exists()]  # a run may end before its last round
     curve = [] if len(there) < 2 else [(each, tried("choice", each)["successes"]) for each in there]
     ranked = sorted(curve, key=lambda point: (rate(point[1]), point[0].at))
-    best = [candidate for candidate, _ in ranked[-_N_BEST:]]
+    best = [candidate for candidate, _ in ranked[-N_BEST:]]
     scored = {each.name: tried("held_out", each) for each in dict.fromkeys([*best, there[-1]])}
     last = scored[there[-1].name]
     if int(cell.seed) == int(cell.plan.text["sizes"][cell.size]["seeds"][0]):
@@ -278,7 +277,7 @@ def print_plan(cells: Sequence[Cell], table: Table) -> None:
                 continue
             known.add(step.folder)
             is_sure = "held_out" not in step.folder.name or step.folder.name.endswith("-last")
-            print(printable(step.shown if is_sure else f"# if it is among the best {_N_BEST}:\n{step.shown}"))
+            print(printable(step.shown if is_sure else f"# if it is among the best {N_BEST}:\n{step.shown}"))
             needed[step.name] += not is_done(cell, table)
     cost = sum(n * statistics.median(measured[name]) for name, n in needed.items() if name in measured)
     print(f"\n{len(cells)} cells. What is missing takes about {cost / 60:.1f} hours of a core.")

@@ -21,6 +21,9 @@ Row = dict[str, Any]
 KEY = ("study", "task", "variant", "seed", "size")
 """What a row is about; there is one of each."""
 
+N_BEST = 3
+"""Checkpoints that were best on the seeds of choice, and are evaluated on held-out ones."""
+
 _KINDS: Row = {
     **dict.fromkeys(("successes", "acted_early"), str),
     **dict.fromkeys(("best", "groups", "versions"), (dict, str)),
@@ -75,9 +78,7 @@ class Table:
         """
         theirs, known = other.rows(), {key_of(row) for row in self.rows()}
         if not theirs:
-            raise InputError(
-                f"{other.folder} holds no rows: give a folder of STUDY.jsonl that playbyear-reproduce wrote."
-            )
+            raise InputError(f"{other.folder} holds no rows: give a folder of STUDY.jsonl from playbyear-reproduce.")
         new = [row for row in theirs if key_of(row) not in known]
         self.put(new)
         return len(new)

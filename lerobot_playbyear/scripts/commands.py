@@ -85,9 +85,7 @@ def _work_of(where: str, **options: Any) -> Callable[[], None]:
 attach_audio = _work_of("audio.attach_audio:attach_audio", is_file_work=True)
 attach_spectrogram = _work_of("audio.attach_spectrogram:attach_spectrogram", is_file_work=True)
 find_microphones = _work_of("microphones.finding:find_microphones", is_file_work=True)
-push = _work_of(
-    "hub.push:push", interrupted="Interrupted. The same command goes on; what has arrived is not sent again."
-)
+push = _work_of("hub.push:push", interrupted="Interrupted. The same command goes on; what arrived is not sent again.")
 reproduce = _work_of(
     "reproduce.run:reproduce", interrupted="Interrupted. The same command goes on.", words=("action", "folder")
 )

@@ -10,13 +10,7 @@ from lerobot.teleoperators.gamepad import GamepadTeleop
 
 from lerobot_playbyear.compat import has_gamepad, import_devices
 from lerobot_playbyear.episodes.experts import Expert, ExpertConfig, ExpertError
-from lerobot_playbyear.teleoperation.controls import (
-    MOVES,
-    OVERRIDE,
-    TAKEN,
-    KeyboardWindowTeleop,
-    KeyboardWindowTeleopConfig,
-)
+from lerobot_playbyear.teleoperation.controls import MOVES, TAKEN, KeyboardWindowTeleop, KeyboardWindowTeleopConfig
 from lerobot_playbyear.teleoperation.expert import TeleopExpert
 from lerobot_playbyear.teleoperation.window import NAMED_KEYS, Window
 
@@ -48,7 +42,7 @@ class TeleopExpertConfig(ExpertConfig):
     steps_per_second: float | None = None
     begin_paused: bool = True
     takeover: str = "toggle"
-    takeover_key: str = OVERRIDE
+    takeover_key: str = "tab"
     play_sound: bool = True
 
     def make(self, env: gym.Env, demonstrates: bool = False) -> Expert:
@@ -103,9 +97,7 @@ def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoper
     """
     option = f"--expert.teleop.type={config.type}"
     if config.type == "keyboard_ee":
-        raise ExpertError(
-            f"{option} hears what is typed into other windows: give --expert.teleop.type=keyboard_window."
-        )
+        raise ExpertError(f"{option} hears what is typed in other windows: give --expert.teleop.type=keyboard_window.")
     try:
         if isinstance(config, KeyboardWindowTeleopConfig):
             teleop: Teleoperator = KeyboardWindowTeleop(config, window.keys)

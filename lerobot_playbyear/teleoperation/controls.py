@@ -75,7 +75,7 @@ class Controls:
         verdict: How they end the attempt, if so.
     """
 
-    def __init__(self, teleop: Teleoperator, keys: WindowKeys, toggles: bool = True, override: str = OVERRIDE) -> None:
+    def __init__(self, teleop: Teleoperator, keys: WindowKeys, toggles: bool, override: str) -> None:
         self._teleop, self._keys = teleop, keys
         self._toggles, self._override, self._is_on = toggles, override, False
         self._events: dict[TeleopEvents, bool] = {}

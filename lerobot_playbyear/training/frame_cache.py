@@ -99,6 +99,7 @@ def dataset_identity(reader: DatasetReader, features: Mapping[str, Any]) -> dict
     names |= {str(meta.get_video_file_path(episode, key)) for episode in episodes for key in cameras}
     if any(feature["dtype"] == "image" for feature in features.values()):
         names |= {path.relative_to(root).as_posix() for path in root.glob("images/**/*") if path.is_file()}
+    stats = {name: file_inside(root, name).stat() for name in sorted(names)}
     return {
         "root": str(root.resolve()),
         "features": json.loads(json.dumps(features, default=str)),
@@ -106,13 +107,8 @@ def dataset_identity(reader: DatasetReader, features: Mapping[str, Any]) -> dict
         "tolerance_s": TOLERANCE_S,
         "episodes": episodes,
         "video_starts": {key: [meta.episodes[i][f"videos/{key}/from_timestamp"] for i in episodes] for key in cameras},
-        "files": {name: _stamp(file_inside(root, name)) for name in sorted(names)},
+        "files": {name: [s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_ino] for name, s in stats.items()},
     }
-
-
-def _stamp(path: Path) -> list[int]:
-    details = path.stat()
-    return [details.st_size, details.st_mtime_ns, details.st_ctime_ns, details.st_ino]
 
 
 @contextlib.contextmanager
