@@ -6,7 +6,8 @@ A whole update counts: augmentation, spectrograms, network, gradients, clipping 
 (`benchmarks/reference.py`) runs in a process of its own, with PyTorch's own memory allocation, in turn with ours. The limit
 is the time that the ResNet's forward and backward pass alone take for the frames that an update encodes. Then, on one thread,
 what hearing costs an update of the preset `cpu`: neighbouring windows share the columns of the spectrogram in which they
-coincide, with 25 ms between them all, with the paper's 35 ms those of every seventh frame. And what rooms cost it.
+coincide, with 25 ms between them all, with the paper's 35 ms those of every seventh frame. And what rooms and a reference
+microphone cost it.
 Noise as data.
 """
 
@@ -34,6 +35,7 @@ EARS = {
     "35 ms": {"hop_s": 0.035},
     "deaf": {"use_audio": False},
     "in rooms": {"audio_room_noise": True},
+    "second": {"audio_room_noise": True, "n_microphones": 2, "reference_microphone": "gripper1"},
 }
 
 
@@ -119,6 +121,7 @@ def hearing(turns: int) -> list[Row]:
     return [
         Row(name, ms["25 ms"], "ms", *beside),
         Row(f"{name}, in rooms", ms["in rooms"], "ms", "without", ms["25 ms"]),
+        Row(f"{name}, in rooms, with a reference microphone", ms["second"], "ms", "without", ms["in rooms"]),
     ]
 
 

@@ -18,19 +18,22 @@ from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts.commands import train
 
 
-@pytest.fixture(scope="module")
-def arm_dataset(tmp_path_factory):
-    """Two short episodes of the arm of joints, with a microphone."""
+def record_arm(root: Path, microphones=("gripper",)) -> Path:
+    """Two short episodes of the arm of joints, with microphones."""
     numbers = {"dtype": "float32", "shape": (3,), "names": ["shoulder.pos", "elbow.pos", "gripper.pos"]}
     features = {
         "observation.images.front": {"dtype": "image", "shape": (48, 64, 3), "names": ["height", "width", "channel"]},
         "observation.state": numbers,
-        "observation.audio.gripper": audio_feature(sample_rate=16000, fps=20),
+        **{f"observation.audio.{name}": audio_feature(sample_rate=16000, fps=20) for name in microphones},
         "action": numbers,
     }
-    root = tmp_path_factory.mktemp("rollout") / "arm"
     make_dataset(root, (12, 12), features=features, repo_id="tests/arm")
     return root
+
+
+@pytest.fixture(scope="module")
+def arm_dataset(tmp_path_factory):
+    return record_arm(tmp_path_factory.mktemp("rollout") / "arm")
 
 
 def train_on(arm_dataset, folder, *options):
@@ -74,11 +77,12 @@ def test_a_policy_that_hears_says_that_there_is_no_sound_and_moves_nothing(polic
         rollout(policy, "--inference.type=rtc")
 
 
-def microphone(folder: Path) -> str:
-    """A card that plays noise, no place of it like another."""
+def microphone(folder: Path, *names: str) -> str:
+    """Cards that play noise, no place of it like another."""
     noise = np.random.default_rng(3).normal(0, 3000, 30 * 16000).astype(np.int16)
     path = write_audio(folder / "noise.wav", noise, 16000)
-    return f"--robot.cameras={{gripper: {{type: microphone, file: {path}, save_to: none}}}}"
+    cards = (f"{name}: {{type: microphone, file: {path}, save_to: none}}" for name in names or ("gripper",))
+    return f"--robot.cameras={{{', '.join(cards)}}}"
 
 
 @pytest.fixture
@@ -119,6 +123,16 @@ def test_a_policy_hears_on_a_robot_what_its_recording_holds(strategy, policy, to
         kept = np.array(dataset.hf_dataset.with_format("numpy")["observation.audio.gripper"])
         assert len(heard) - len(kept) in (0, 1)  # the last step may come too late to be kept
         np.testing.assert_array_equal((np.array(heard)[: len(kept)] * 32768).astype(np.int16), kept)
+
+
+def test_a_reference_microphone_is_another_camera_of_the_robot(told, heard, tmp_path):
+    two = record_arm(tmp_path / "arm", ("gripper", "room"))
+    policy = train_on(two, tmp_path / "train", "--policy.reference_microphone=room")
+    with pytest.raises(InputError, match=r"hears 'room'.*the cameras are front, gripper"):
+        rollout(policy, microphone(tmp_path))
+    assert told == []
+    rollout(policy, microphone(tmp_path, "gripper", "room"))
+    assert len(told) >= len(heard) >= 5
 
 
 @pytest.mark.slow

@@ -387,7 +387,7 @@ class PlaybyearConfig(PreTrainedConfig):
             return
         if not self.audio_keys:
             raise ValueError(_no_microphone_in(features))
-        if self.reference_key and {self.reference_key} & {*self.audio_keys} in (set(), {*self.audio_keys}):
+        if self.reference_key and (self.reference_key not in self.audio_keys or len(self.audio_keys) == 1):
             raise ValueError(
                 f"--policy.reference_microphone={self.reference_microphone} must be one of two microphones or more, and the "
                 f"observations have {self.audio_keys}: name one of them, or leave the option out."
