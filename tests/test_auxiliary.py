@@ -206,3 +206,21 @@ def test_the_balance_is_who_hears_an_onset_louder_and_needs_two_ears():
     assert for_left < 0.02 < 3 < for_right
     assert errors([0.0, math.log(100.0)]) == pytest.approx([for_right, for_left], abs=0.05)
     assert make_policy(auxiliary_balance=1.0).model.auxiliary is None
+
+
+def test_nothing_has_to_be_told_of_what_the_reference_microphone_hears():
+    """It is encoded by nothing: a head that had to tell it would guess."""
+    policy = make_policy(microphones=("left", "right", "room"), reference_microphone="room", **HEADS)
+    seen = []
+    policy.model.auxiliary.register_forward_pre_hook(lambda _, inputs: seen.extend(inputs[0]))
+    batch = batch_of(policy)
+    policy.forward(batch)
+    n = policy.config.n_audio_frames
+    assert [
+        any(torch.equal(wave, batch[key][:, -n:] / 32768) for wave in seen) for key in policy.config.audio_keys
+    ] == [
+        True,
+        True,
+        False,
+    ]
+    assert policy.model.auxiliary.heads["balance"][-1].out_features == 2

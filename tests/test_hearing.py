@@ -76,33 +76,34 @@ def test_sound_that_cannot_be_is_refused_with_its_key(value, message):
 
 
 def test_what_the_reference_microphone_hears_too_is_not_heard():
-    """A voice changes no action, whatever the two microphones' gains are; what one of them hears by itself does."""
+    """A voice changes no action, whatever the two microphones' gains are; what the arm's alone hears does."""
     two = {"microphones": ("gripper", "room"), "audio_envelope_gain": 3.0}
     policy = make_policy(**two, reference_microphone="room")
     ears = policy.model.spectrogram
     ears["audio_room"].mean.copy_(ears["audio_gripper"].mean - 1.5)  # hears 15 dB less of everything
     episode = make_episode(seed=1, config=policy.config, n_frames=10)
-    background, bang = episode["observation.audio.gripper"] // 100, 8 * episode["observation.audio.room"][-3:]
+    noise, bang = episode["observation.audio.gripper"], 6 * episode["observation.audio.room"][-3:]
 
     def actions(policy, gripper, room):
-        heard = {name: background.clone() for name in ("gripper", "room")}
+        heard = {name: noise.clone() for name in ("gripper", "room")}
         heard["gripper"][-3:] += gripper * bang
         heard["room"][-3:] += room * bang
         heard["room"] = (heard["room"] / 10**0.75).to(torch.int16)
         return step_through(policy, [episode | {f"observation.audio.{name}": wave for name, wave in heard.items()}])[0]
 
-    quiet = actions(policy, 0, 0)
-    torch.testing.assert_close(actions(policy, 1, 1), quiet, atol=1e-6, rtol=0)
-    assert (actions(policy, 1, 0) - quiet)[-3:].abs().max() > 1e-4
-    plain = make_policy(**two)
-    assert (actions(plain, 1, 1) - actions(plain, 0, 0))[-3:].abs().max() > 1e-4
+    def changes(policy, gripper, room):
+        return float((actions(policy, gripper, room) - actions(policy, 0, 0)).abs().max())
+
+    assert 10 * changes(policy, 1, 1) < changes(make_policy(**two), 1, 1)
+    assert 10 * changes(policy, 1, 1) < changes(policy, 1, 0)
 
 
 @pytest.mark.parametrize(("microphones", "name"), [(("gripper",), "gripper"), (("gripper", "table"), "room")])
 def test_a_reference_microphone_that_is_not_there_or_alone_is_refused(microphones, name):
     config = make_config(microphones=microphones, reference_microphone=name)
     with pytest.raises(
-        ValueError, match=rf"reference_microphone={name} must be one of two microphones or more.*{microphones[0]}"
+        ValueError,
+        match=rf"reference_microphone={name} must be one of two microphones or more; there are: {microphones[0]}",
     ):
         PlaybyearPolicy(config)
 

@@ -20,7 +20,7 @@ _FAR = 1.0  # [normalised units] what is farther away is told as that far: carry
 
 def weights_of(config: PlaybyearConfig) -> dict[str, float]:
     """The weight of each kind of loss. A policy leaves out what it has not ears, or a body, enough for: all take one preset."""
-    n_ears = len(config.audio_keys) - (config.reference_key is not None) if config.use_audio else 0
+    n_ears = len(config.heard_keys) if config.use_audio else 0
     can = {"onset": n_ears >= 1, "balance": n_ears >= 2, "way": n_ears >= 1 and bool(config.low_dimensional_keys)}
     return {kind: getattr(config, f"auxiliary_{kind}") if is_able else 0.0 for kind, is_able in can.items()}
 
@@ -39,7 +39,7 @@ class AuxiliaryHeads(nn.Module):
         super().__init__()
         self.weights, self.memory_steps = weights_of(config), config.memory_steps
         n_felt = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
-        sizes = {"onset": 1, "balance": len(config.audio_keys), "way": n_felt}
+        sizes = {"onset": 1, "balance": len(config.heard_keys), "way": n_felt}
         self.heads = nn.ModuleDict()
         for kind in (kind for kind in sizes if self.weights[kind]):
             layers = (nn.Linear(config.embedding_size, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, sizes[kind]))
@@ -51,7 +51,7 @@ class AuxiliaryHeads(nn.Module):
         """The losses of a batch.
 
         Args:
-            waves: Of every microphone (B, n_audio_frames, S), in [-1, 1], without augmentation.
+            waves: Of every microphone that is encoded (B, n_audio_frames, S), in [-1, 1], without augmentation.
             felt: Every low-dimensional observation (B, n_run_frames, its numbers), without noise.
             encodings: (B, K, D) joint encodings of the frames that the windows end at.
             outputs: (B, K, D) the memory's outputs after the windows.

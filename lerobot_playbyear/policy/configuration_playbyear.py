@@ -66,8 +66,8 @@ class PlaybyearConfig(PreTrainedConfig):
         segment_s, hop_s: Segment length and hop length of the spectrogram [s].
         n_frequency_bins: Number of frequency bins kept from the lowest up. A bin is 1 / segment_s wide.
         image_size: Height and width of the images for the vision encoder [pixels]. 84 trains about five times faster than 224.
-        reference_microphone: Name of a microphone that stands in the room, away from the arm. What it hears, to within 10 dB of
-            what another one does, each relative to its usual background, is taken out of that one's spectrogram. None: none.
+        reference_microphone: Name of a microphone that stands in the room, away from the arm. Of the others everything is heard
+            as average that is not 10 dB louder than there, each above its own mean. None: none.
         audio_steps: Names in LeRobot's ProcessorStepRegistry: processing steps for the sound before the network, in training
             and at rollout. A trained policy keeps its own (`extension.MicrophoneStep`).
         extension_options: Options of encoders and `audio_steps` of other packages, by their names, such as `{waveform_cnn:
@@ -210,6 +210,11 @@ class PlaybyearConfig(PreTrainedConfig):
     def reference_key(self) -> str | None:
         """Of the microphone that is heard to be taken out."""
         return None if self.reference_microphone is None else f"{AUDIO_PREFIX}{self.reference_microphone}"
+
+    @property
+    def heard_keys(self) -> list[str]:
+        """Of the microphones that are encoded: all but the reference."""
+        return [key for key in self.audio_keys if key != self.reference_key]
 
     @property
     def camera_keys(self) -> list[str]:
@@ -387,10 +392,12 @@ class PlaybyearConfig(PreTrainedConfig):
             return
         if not self.audio_keys:
             raise ValueError(_no_microphone_in(features))
-        if self.reference_key and (self.reference_key not in self.audio_keys or len(self.audio_keys) == 1):
+        names = [key.removeprefix(AUDIO_PREFIX) for key in self.audio_keys]
+        if self.reference_key and (self.reference_microphone not in names or len(names) == 1):
             raise ValueError(
-                f"--policy.reference_microphone={self.reference_microphone} must be one of two microphones or more, and the "
-                f"observations have {self.audio_keys}: name one of them, or leave the option out."
+                f"--policy.reference_microphone={self.reference_microphone} must be one of two microphones or more; there are: "
+                f"{', '.join(names)}. Name one that stands in the room, record with another one (in a simulation "
+                '--env.microphones=\'["gripper","room"]\'), or leave the option out.'
             )
         if self.sample_rate is None:
             raise ValueError(f"The sample rate of {self.audio_keys} is not known: set --policy.sample_rate.")

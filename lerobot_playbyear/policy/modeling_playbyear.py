@@ -153,7 +153,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         if network.auxiliary is None or not self.training:
             return loss, {}
         figures = {"loss_action": loss.detach().mean()}
-        waves = [to_float_wave(self._newest(batch, key, config.n_audio_frames), key) for key in config.audio_keys]
+        waves = [to_float_wave(self._newest(batch, key, config.n_audio_frames), key) for key in config.heard_keys]
         felt = [self._newest(batch, key, config.n_run_frames).flatten(2) for key in config.low_dimensional_keys]
         fused = encodings[:, -n_windows:, : config.embedding_size]
         for kind, (error, counts) in network.auxiliary(waves, felt, fused, outputs).items():

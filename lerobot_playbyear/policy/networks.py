@@ -19,12 +19,12 @@ from lerobot_playbyear.policy.extension import make_encoder, register_audio_enco
 from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
 from lerobot_playbyear.policy.optimization import HAS_512_BITS
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
-from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
+from lerobot_playbyear.policy.spectrogram import EPSILON, LogSpectrogram, SharedStretches, to_float_wave
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
 _ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
-_NEARER = 1.0  # [10 dB] by which the arm's own sound is louder than at the reference microphone
+_NEARER = 1.0  # [10 dB] by which the arm's own sound is louder than at the reference microphone, each above its mean
 _SHARPNESS = 4.0  # a choice among frames is learned in as few updates as the rest
 
 
@@ -46,18 +46,17 @@ class PlaybyearNetwork(nn.Module):
             grid = (config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins)
             self.spectrogram = nn.ModuleDict()
             self.hearing = nn.ModuleDict()
-            for key in config.audio_keys:
-                encoder, name = make_encoder("audio_encoder", config), _module_name(key)
-                hears_waveform = getattr(encoder, "hears_waveform", False)
-                if hears_waveform and config.reference_key:
-                    raise ValueError(
-                        f"--policy.audio_encoder={config.audio_encoder} hears the waveform, and "
-                        "--policy.reference_microphone takes noise out of spectrograms: leave one of the two out."
-                    )
-                if key != config.reference_key:
-                    self.hearing[name] = encoder
-                if not hears_waveform or config.audio_envelope_gain:
-                    self.spectrogram[name] = LogSpectrogram(*grid, config.spectrogram_momentum)
+            for key in config.heard_keys:
+                self.hearing[_module_name(key)] = make_encoder("audio_encoder", config)
+            hears_waveform = any(getattr(encoder, "hears_waveform", False) for encoder in self.hearing.values())
+            if hears_waveform and config.reference_key:
+                raise ValueError(
+                    f"--policy.audio_encoder={config.audio_encoder} hears the waveform, and "
+                    "--policy.reference_microphone takes noise out of spectrograms: leave one of the two out."
+                )
+            if not hears_waveform or config.audio_envelope_gain:
+                for key in config.audio_keys:
+                    self.spectrogram[_module_name(key)] = LogSpectrogram(*grid, config.spectrogram_momentum)
             self.disturb = SoundAugmentation(config)
             n_columns = config.n_segments if config.audio_envelope_gain else 0
             sizes += [encoder.embedding_size + n_columns for encoder in self.hearing.values()]  # type: ignore[misc, operator]
@@ -100,6 +99,7 @@ class PlaybyearNetwork(nn.Module):
     def _hear_all(self, batch: dict[str, Tensor], n_frames: int) -> list[Tensor]:
         """Embeddings of every microphone but the reference, (B * n, embedding size); in training all are in the same room."""
         config = self.config
+        assert config.sample_rate is not None
         n_heard, keys = n_frames + config.audio_frames - 1, config.audio_keys
         sounds = [newest(batch, key, n_heard, config.feature_shape(key)) for key in keys]  # (B, n_heard, S) each
         waves = [to_float_wave(sound.flatten(1), key) for sound, key in zip(sounds, keys, strict=True)]
@@ -112,7 +112,7 @@ class PlaybyearNetwork(nn.Module):
         is_pad = before_episode(batch, n_heard)  # (B, n_heard)
         if is_pad is not None:
             begun = ~is_pad.repeat_interleave(n_samples, dim=1)
-        _, hop = segment_and_hop(config.sample_rate or 0, config.segment_s, config.hop_s)
+        _, hop = segment_and_hop(config.sample_rate, config.segment_s, config.hop_s)
         # Neighbouring windows overlap: their segments are computed once.
         shared = SharedStretches(n_frames, n_samples, config.window_samples, hop)
         levels: dict[str, Tensor] = {}  # (B * n_stretches, bins, columns) each
@@ -123,14 +123,16 @@ class PlaybyearNetwork(nn.Module):
                 spectrogram = self.spectrogram[_module_name(key)]
                 levels[key] = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
         if config.reference_key is not None:
-            levels = self._own(levels, config.reference_key)
-        heard = {key: wave * begun for key, wave in zip(keys, waves, strict=True) if key != config.reference_key}
+            levels = self._masked(levels, config.reference_key)
+        heard = {key: wave * begun for key, wave in zip(keys, waves, strict=True) if key in config.heard_keys}
         return [self._hear(key, shared, wave, levels.get(key)) for key, wave in heard.items()]
 
-    def _own(self, levels: dict[str, Tensor], reference: str) -> dict[str, Tensor]:
+    def _masked(self, levels: dict[str, Tensor], reference: str) -> dict[str, Tensor]:
         """Spectrograms, with the average wherever the reference microphone hears as much, each above its own mean."""
-        deviation = {key: self.spectrogram[_module_name(key)].get_buffer("variance").sqrt() for key in levels}
-        above = {key: level.detach() * deviation[key][:, None] for key, level in levels.items()}  # [10 dB]
+        variance = {key: self.spectrogram[_module_name(key)].get_buffer("variance") for key in levels}
+        above = {
+            key: level.detach() * (variance[key] + EPSILON).sqrt()[:, None] for key, level in levels.items()
+        }  # [10 dB]
         return {key: level * (above[key] > above[reference] + _NEARER) for key, level in levels.items()}
 
     def _hear(self, key: str, shared: SharedStretches, wave: Tensor, levels: Tensor | None) -> Tensor:

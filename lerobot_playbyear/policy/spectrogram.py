@@ -11,6 +11,7 @@ from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import segment_and_hop
 
 POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
+EPSILON = 1e-5  # of a variance
 _IN_CACHE = 1_000_000  # samples of overlapping segments that a processor's cache holds with what becomes of them
 
 
@@ -166,7 +167,7 @@ class LogSpectrogram(nn.Module):
             levels = levels + colour.unsqueeze(2)
         if self.training and not self.keeps_statistics:
             self._update(levels.detach(), real)
-        levels = (levels - self.mean[:, None]) * torch.rsqrt(self.variance + 1e-5)[:, None]
+        levels = (levels - self.mean[:, None]) * torch.rsqrt(self.variance + EPSILON)[:, None]
         return levels * real
 
     def _update(self, levels: Tensor, real: Tensor) -> None:

@@ -201,7 +201,7 @@ class Plan:
         """In the plan's order: seed by seed, so that what comes first says something of everything."""
         usual, studies = self.text["sizes"][self.size]["seeds"], self.text["studies"].values()
         seeds = sorted({*usual, *(seed for study in studies for seed in study.get("seeds", []))})
-        return [cell for seed in seeds for cell in self._cells_of(int(seed), seed == seeds[0])]
+        return [cell for seed in seeds for cell in self._cells_of(int(seed), seed == usual[0])]
 
     def chosen(self, only: str | None) -> list[Cell]:
         """The cells that are asked for.
