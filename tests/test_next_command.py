@@ -9,8 +9,10 @@ import pytest
 from gymnasium.envs.registration import register
 from support.shared import run_in_process
 
+from lerobot_env_playbyear.config import PlaybyearEnvConfig
 from lerobot_playbyear.datasets.next_command import training_command
 from lerobot_playbyear.scripts.commands import record, train
+from lerobot_playbyear.training.report import evaluation_command
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SHORT = ("--steps=2", "--batch_size=2", "--num_workers=0", "--log_freq=1")
@@ -80,3 +82,15 @@ def test_the_preset_is_the_one_for_the_machine(has_gpu, preset, monkeypatch):
     assert training_command("me/demos", ["observation.images.front", "observation.audio.mic"], "here") == (
         f"playbyear-train --preset={preset} --dataset.repo_id=me/demos --dataset.root=here --output_dir=outputs/train/demos"
     )
+
+
+def test_a_policy_is_evaluated_with_all_the_microphones_that_it_hears():
+    env = PlaybyearEnvConfig(task="OccludedGrasp-v1", microphones=["gripper", "room"])
+    assert shlex.split(evaluation_command(Path("my policy"), env))[1:] == [
+        "--policy.path=my policy",
+        "--env.type=playbyear",
+        "--env.task=OccludedGrasp-v1",
+        '--env.microphones=["gripper","room"]',
+    ]
+    assert "microphones" not in evaluation_command(Path("policy"), PlaybyearEnvConfig(task="OccludedGrasp-v1"))
+    assert evaluation_command(Path("policy"), None) == "lerobot-eval --policy.path=policy --env.type=..."

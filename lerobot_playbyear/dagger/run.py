@@ -31,6 +31,7 @@ from lerobot_playbyear.hub.push import METRICS_NAME, PushOptions, check_upload, 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import PolicyWindows, dataset_names
 from lerobot_playbyear.training.learner import Learner, check_dataset_suits, make_learner
+from lerobot_playbyear.training.report import evaluation_command
 from lerobot_playbyear.training.train import read_store
 
 
@@ -214,9 +215,8 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
         print(f"No update was made: {_why_none(cfg, state)}.\n{go_on}")
         return
     policy = folder.checkpoints / "last" / PRETRAINED_MODEL_DIR
-    env = f" --env.type={cfg.env.type} --env.task={shlex.quote(str(cfg.env.task))}" if cfg.env else " --env.type=..."
     print(f"Policy:      {policy}")
-    print(f"Evaluate:    lerobot-eval --policy.path={policy}{printable(env)}")
+    print(f"Evaluate:    {evaluation_command(policy, cfg.env)}")
     print(go_on)
 
 

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import torch
 from accelerate import Accelerator, PartialState
+from lerobot.envs.configs import EnvConfig
 from lerobot.utils.logging_utils import AverageMeter
 from lerobot.utils.utils import inside_slurm
 from torch import Tensor
@@ -143,11 +144,21 @@ def print_results(cfg: PlaybyearTrainConfig, success: float | None, acted_early:
         print(f"Early:      {acted_early:.1f} % of them acted before anything was heard")
     if cfg.save_checkpoint:
         policy = folder / "checkpoints" / "last" / "pretrained_model"
-        env = f" --env.type={cfg.env.type} --env.task={cfg.env.task}" if cfg.env is not None else " --env.type=..."
         config = shlex.quote(str(policy / "train_config.json"))
         print(f"Policy:     {policy}")
-        print(f"Evaluate:   lerobot-eval --policy.path={shlex.quote(str(policy))}{printable(env)}")
+        print(f"Evaluate:   {evaluation_command(policy, cfg.env)}")
         print(f"Go on:      playbyear-train --resume=true --config_path={config} --steps={2 * cfg.steps}")
+
+
+def evaluation_command(policy: Path, env: EnvConfig | None) -> str:
+    """What to type to evaluate a policy where it was trained or corrected."""
+    if env is None:
+        return printable(f"lerobot-eval --policy.path={shlex.quote(str(policy))} --env.type=...")
+    options = {"policy.path": policy, "env.type": env.type, "env.task": env.task}
+    ears = getattr(env, "microphones", None) or []
+    if len(ears) > 1:
+        options["env.microphones"] = json.dumps(ears, separators=(",", ":"))
+    return printable(shlex.join(["lerobot-eval", *(f"--{name}={value}" for name, value in options.items())]))
 
 
 class Figures:
