@@ -58,9 +58,8 @@ def _section(config: PlaybyearConfig) -> str:
     features = config.input_features or {}
     ears = config.audio_keys if config.use_audio else []
     heard = [f"{code(key)}: {config.sample_rate:,} Hz, {features[key].shape[0]:,} samples a step" for key in ears]
-    heard += (
-        [f"{code(config.reference_key)} stands in the room, the reference"] if ears and config.reference_key else []
-    )
+    if ears and config.reference_key:
+        heard.append(f"{code(config.reference_key)} is the reference, away from the arm")
     seen = [code(key) for key in config.camera_keys] if config.use_vision else []
     rows = [
         ("Microphones", "<br>".join(heard) or "none: it is deaf"),

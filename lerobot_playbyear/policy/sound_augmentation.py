@@ -88,10 +88,8 @@ class SoundAugmentation(nn.Module):
     def colour(self, n_items: int, n_microphones: int) -> Tensor:
         """A microphone's gain in every bin of the spectrogram, a smooth curve, (B, M, bins) [10 dB]."""
         n_drawn = 1 if self.has_reference else n_microphones  # what differs between two is in their means
-        points = torch.randn(n_items, n_drawn, _COLOUR_POINTS, device=self.response.device).expand(
-            -1, n_microphones, -1
-        )
-        return _COLOUR_DB / 10 * points @ self.response.T
+        points = torch.randn(n_items, n_drawn, _COLOUR_POINTS, device=self.response.device)
+        return (_COLOUR_DB / 10 * points @ self.response.T).expand(-1, n_microphones, -1)
 
     def _own(self, max_db: float, n_items: int, n_microphones: int, n: int, n_bins: int) -> Tensor:
         """The spectrum of each microphone's own noise, (B, M, bins) complex, in units of its floor: broadband, with a hum.
