@@ -35,7 +35,7 @@ EARS = {
     "35 ms": {"hop_s": 0.035},
     "deaf": {"use_audio": False},
     "in rooms": {"audio_room_noise": True},
-    "second": {"audio_room_noise": True, "n_microphones": 2, "reference_microphone": "gripper1"},
+    "with a reference": {"audio_room_noise": True, "n_microphones": 2, "reference_microphone": "gripper1"},
 }
 
 
@@ -121,7 +121,7 @@ def hearing(turns: int) -> list[Row]:
     return [
         Row(name, ms["25 ms"], "ms", *beside),
         Row(f"{name}, in rooms", ms["in rooms"], "ms", "without", ms["25 ms"]),
-        Row(f"{name}, in rooms, with a reference microphone", ms["second"], "ms", "without", ms["in rooms"]),
+        Row(f"{name}, in rooms, with a reference microphone", ms["with a reference"], "ms", "without", ms["in rooms"]),
     ]
 
 

@@ -124,31 +124,30 @@ class PlaybyearNetwork(nn.Module):
                 levels[key] = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
         if config.reference_key is not None:
             levels = self._masked(levels, config.reference_key)
-        heard = {key: wave * begun for key, wave in zip(keys, waves, strict=True) if key in config.heard_keys}
-        return [self._hear(key, shared, wave, levels.get(key)) for key, wave in heard.items()]
+        heard = dict(zip(keys, waves, strict=True))
+        return [self._hear(key, shared, heard[key], begun, levels.get(key)) for key in config.heard_keys]
 
     def _masked(self, levels: dict[str, Tensor], reference: str) -> dict[str, Tensor]:
         """Spectrograms, with the average wherever the reference microphone hears as much, each above its own mean."""
         variance = {key: self.spectrogram[_module_name(key)].get_buffer("variance") for key in levels}
-        above = {
-            key: level.detach() * (variance[key] + EPSILON).sqrt()[:, None] for key, level in levels.items()
-        }  # [10 dB]
+        above = {key: level * (variance[key] + EPSILON).sqrt()[:, None] for key, level in levels.items()}  # [10 dB]
         return {key: level * (above[key] > above[reference] + _NEARER) for key, level in levels.items()}
 
-    def _hear(self, key: str, shared: SharedStretches, wave: Tensor, levels: Tensor | None) -> Tensor:
+    def _hear(self, key: str, shared: SharedStretches, wave: Tensor, begun: Tensor, levels: Tensor | None) -> Tensor:
         """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` also its columns' means.
 
         Args:
             key: The microphone's.
             shared: The windows' stretches.
-            wave: What it heard, (B, n_heard * S), 0 where the episode had not begun.
+            wave: What it heard, (B, n_heard * S).
+            begun: Whether the episode had begun, the same shape.
             levels: Its spectrogram, (B * n_stretches, bins, columns).
         """
         config, encoder = self.config, self.hearing[_module_name(key)]
         n_columns = getattr(encoder, "window_columns", None)
         if getattr(encoder, "hears_waveform", False):
             start = wave.shape[1] - shared.length - (shared.n_windows - 1) * shared.step
-            windows = wave[:, start:].unfold(1, shared.length, shared.step)  # (B, n, samples)
+            windows = (wave * begun)[:, start:].unfold(1, shared.length, shared.step)  # (B, n, samples)
             embeddings = encoder(windows.flatten(0, 1))
         elif isinstance(n_columns, int):  # convolutional along time: embeddings overlap, too
             assert levels is not None
