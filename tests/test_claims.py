@@ -57,10 +57,14 @@ def listed(figures: str) -> str:
 
 def main_table() -> list[str]:
     lines = []
-    for name, variant in (("**full policy**", "no_interventions"), ("deaf policy", "no_interventions-no_audio")):
-        found = [rows("offline", task, variant) for task in TASKS]
-        lines.append(f"| {name} | {' | '.join(whole(own, '**') for own in found)} |")
-        lines.append(f"| by seed | {' | '.join(map(each, found))} |")
+    for name, study, variant in (
+        ("**full policy**", "offline", "no_interventions"),
+        ("**100 demonstrations, 2,500 updates**", "twice", "no_interventions"),
+        ("deaf policy", "offline", "no_interventions-no_audio"),
+    ):
+        found = [rows(study, task, variant, may_miss=study == "twice") for task in TASKS]
+        lines.append(f"| {name} | {' | '.join(whole(own, '**') if own else '-' for own in found)} |")
+        lines.append(f"| by seed | {' | '.join(each(own) if own else '-' for own in found)} |")
     players = [
         row["players"] for task in TASKS for row in ROWS if (row["task"], row["variant"]) == (task, "blind_scripts")
     ]

@@ -83,20 +83,22 @@ TASKS = dict(
         strict=True,
     )
 )
-COLUMNS = ("full policy", "deaf policy", "best blind script", "expert")
-
-
-_VARIANTS = {"full policy": "no_interventions", "deaf policy": "no_interventions-no_audio"}
+_TRAINED = {
+    "full policy": ("offline", "no_interventions"),
+    "deaf policy": ("offline", "no_interventions-no_audio"),
+    "100 demonstrations, 2,500 updates": ("twice", "no_interventions"),
+}
+COLUMNS = (*_TRAINED, "best blind script", "expert")
 
 
 def committed() -> dict[tuple[str, str], int]:
     """Success [%] by task and by who acts, from the tables in results/."""
     rows, figures = Table(ROOT / "results").rows("cpu"), {}
     for name, task in TASKS.items():
-        for column, variant in _VARIANTS.items():
-            own = [row for row in rows if (row["study"], row["task"], row["variant"]) == ("offline", task, variant)]
-            successes = "".join(row["successes"] for row in own)
-            figures[name, column] = round(100 * successes.count("1") / len(successes))
+        for column, (study, variant) in _TRAINED.items():
+            own = [row for row in rows if (row["study"], row["task"], row["variant"]) == (study, task, variant)]
+            if successes := "".join(row["successes"] for row in own):
+                figures[name, column] = round(100 * successes.count("1") / len(successes))
         (scripts,) = (row["players"] for row in rows if (row["task"], row["variant"]) == (task, "blind_scripts"))
         shares = {player: 100 * each["successes"] / each["n_episodes"] for player, each in scripts.items()}
         figures[name, "expert"] = round(shares.pop("expert"))

@@ -16,7 +16,7 @@ RECIPES = Path(__file__).with_name("recipes")
 """Folder of the presets' files."""
 
 PRESETS = {
-    "cpu": "two CPU cores, within the hour",
+    "cpu": "one or two CPU cores, 6 to 17 minutes",
     "gpu": "the paper's number of windows at 224 pixels, for a GPU; 5 minutes on an H200",
     "paper": "the published experiment: 1.6 million windows at 224 pixels, for a GPU",
 }

@@ -77,8 +77,8 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     batches = make_batches(accelerator, windows, store, cfg.batch_size, cfg.seed or 0, learner.step)
     n_parameters = format_big_number(sum(p.numel() for p in learner.policy.parameters() if p.requires_grad))
     logging.info(
-        f"{n_parameters} parameters on {accelerator.device}, steps {learner.step} to {cfg.steps} of {cfg.batch_size} runs, "
-        f"output in {cfg.output_dir}"
+        f"{n_parameters} parameters on {accelerator.device}, steps {learner.step} to {cfg.steps} of {cfg.batch_size} "
+        f"sequences, output in {cfg.output_dir}"
     )
     with Report(cfg, store, learner) as report:
         _loop(cfg, learner, batches, held_out_loss, report)
