@@ -54,7 +54,7 @@ class BagExpert(Script):
     FURTHER = 0.010  # how far from a grasp that was empty it tries again, along x and y
     HOVER = 0.022  # how high above the last touch it goes aside
     DEEP = 0.020  # how far below a touch of the things it goes at most
-    ASIDE = -0.004  # how much further than the middle of where they may lie it goes to the side on which it felt them
+    ASIDE = 0.002  # how much further than the middle of where they may lie it goes to the side on which it felt them
     AIM = 0.004  # how far from the bag's middle it goes in
     ABOVE_BOTTOM = 0.003  # in a search
     CLOSING = 5  # for so long before it looks whether it holds something
@@ -155,9 +155,10 @@ class BagExpert(Script):
 
     def _centre(self):
         goal = np.array([*self._aim, self._touched_at + self.HOVER])
-        if np.linalg.norm(goal - self.env.eef_position) < 0.004 and self._is_open():
+        distance = float(np.linalg.norm(goal - self.env.eef_position))
+        if distance < 0.004 and self._is_open():
             self.phase = "lower"
-        return goal, self.fast, False
+        return goal, float(np.clip(0.5 * distance, 0.004, self.fast)), False  # in one step nobody learns how far
 
     def _lower(self):
         height = self.env.eef_position[2]
