@@ -200,7 +200,7 @@ class Plan:
     def cells(self) -> list[Cell]:
         """In the plan's order: seed by seed, so that what comes first says something of everything."""
         usual, studies = self.text["sizes"][self.size]["seeds"], self.text["studies"].values()
-        seeds = sorted({*usual, *(seed for study in studies for seed in study.get("seeds", []))})
+        seeds = sorted({*usual, *(seed for study in studies for seed in study.get("seeds", {}).get(self.size, []))})
         return [cell for seed in seeds for cell in self._cells_of(int(seed), seed == usual[0])]
 
     def chosen(self, only: str | None) -> list[Cell]:
@@ -229,7 +229,8 @@ class Plan:
     def _cells_of(self, seed: int, is_first: bool) -> Iterator[Cell]:
         size = self.text["sizes"][self.size]
         for study, content in self.text["studies"].items():
-            if self.size not in content.get("sizes", [self.size]) or seed not in content.get("seeds", size["seeds"]):
+            seeds = content.get("seeds", {}).get(self.size, size["seeds"])
+            if self.size not in content.get("sizes", [self.size]) or seed not in seeds:
                 continue
             shared = (self.text["seeds"], self.text["defaults"], size, content.get("values", {}))
             for task, of_task in content["tasks"].items():

@@ -54,7 +54,6 @@ class BagExpert(Script):
     FURTHER = 0.010  # how far from a grasp that was empty it tries again, along x and y
     HOVER = 0.022  # how high above the last touch it goes aside
     DEEP = 0.020  # how far below a touch of the things it goes at most
-    ASIDE = 0.002  # how much further than the middle of where they may lie it goes to the side on which it felt them
     AIM = 0.004  # how far from the bag's middle it goes in
     ABOVE_BOTTOM = 0.003  # in a search
     CLOSING = 5  # for so long before it looks whether it holds something
@@ -106,8 +105,7 @@ class BagExpert(Script):
 
     def _descend(self):
         if self._feels_contents():
-            sideways = np.mean(self.env.definition.numbers.sideways) + self.ASIDE
-            return self._touched((self._side() or self.turn) * sideways)
+            return self._touched((self._side() or self.turn) * self.env.definition.numbers.aside)
         if self._feels_bottom(self.BOTTOM_FORCE):
             self._bottom = self._touched_at = float(self.env.eef_position[2])
             self.phase, self._way = "search", [self.turn * 0.03, -self.turn * 0.03]
@@ -158,7 +156,7 @@ class BagExpert(Script):
         distance = float(np.linalg.norm(goal - self.env.eef_position))
         if distance < 0.004 and self._is_open():
             self.phase = "lower"
-        return goal, float(np.clip(0.5 * distance, 0.004, self.fast)), False  # in one step nobody learns how far
+        return goal, float(np.clip(self.env.definition.numbers.share * distance, 0.004, self.fast)), False
 
     def _lower(self):
         height = self.env.eef_position[2]
