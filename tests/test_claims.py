@@ -112,7 +112,7 @@ def noise() -> list[str]:
         *(f"| at {n} times the background | {' | '.join(map(whole, found))} |" for n, found in levels.items()),
         *(f"| by seed | {' | '.join(map(each, found))} |" for found in levels.values()),
         f"Pick and Place, one training: {place}",
-        f"Key Bag Easy, one training with that expert: {bag}",
+        f"Key Bag Easy, one training with the earlier expert: {bag}",
         f"In the quiet {quiet}; dull microphones {dull}, telephones {telephones}, boomy ones {boomy}.",
         f"Steady noise at 8 and 16 times the background leaves {whole(loud[0])} and {whole(loud[1])} (",
     ]
