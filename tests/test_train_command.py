@@ -46,9 +46,9 @@ def weights_of(checkpoint):
 
 @pytest.fixture(scope="module")
 def trained(noise, tmp_path_factory):
-    """The output folder of a run of six updates with checkpoints every three."""
+    """The output folder of a run of six updates, three for each episode learned, with checkpoints every three."""
     output = tmp_path_factory.mktemp("run") / "out"
-    options = ("--steps=6", "--save_freq=3", "--store.place=memory")
+    options = ("--steps=1", "--steps_per_episode=3", "--save_freq=3", "--store.place=memory")
     validation = ("--dataset.eval_split=0.3", "--eval_steps=3")
     run_in_process(train, *TINY, *data(noise), *options, *validation, f"--output_dir={output}")
     return output
@@ -65,6 +65,7 @@ def test_a_run_leaves_lerobots_checkpoints_and_its_figures(trained):
     assert all(torch.isfinite(torch.tensor(line["loss"])) for line in lines)
     ours = PlaybyearTrainConfig.from_pretrained(config_of(checkpoints / "last"), cli_args=["--store.device=cpu"])
     assert ours.store == StoreConfig(place="memory", device="cpu")
+    assert (ours.steps, ours.steps_per_episode) == (6, 0)
 
 
 def test_measuring_held_out_episodes_changes_nothing_that_is_learned(trained, noise, tmp_path):
@@ -157,6 +158,7 @@ def test_a_preset_gives_way_to_the_command_line_and_leaves_checkpoints_and_the_h
     assert "--policy.vision_width=16" in given
     told = [arg for arg in given if arg.startswith(("--steps", "--policy.image_size"))]
     assert told == ["--steps=10", "--policy.image_size"]
+    assert "--steps_per_episode=25" in apply_preset(["--preset=cpu"])
     tuned = apply_preset(["--preset=cpu", "--policy.path=somewhere"])
     resumed = apply_preset(["--preset=cpu", "--resume=true"])
     shared = apply_preset(["--preset=cpu", "--policy.repo_id=me/policy"])

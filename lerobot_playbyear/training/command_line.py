@@ -102,6 +102,8 @@ def apply_preset(args: Sequence[str]) -> list[str]:
         from lerobot_playbyear.policy.optimization import computes_bfloat16  # imports torch
 
         options |= {"policy.use_amp": "true"} if computes_bfloat16() else {}
+    if "steps" in given:
+        options.pop("steps_per_episode", None)
     if "policy.repo_id" in given:  # whoever names a place on the Hub wants it used
         options = {key: value for key, value in options.items() if key != "policy.push_to_hub"}
     return [*(f"--{key}={value}" for key, value in options.items() if key not in given), *args]

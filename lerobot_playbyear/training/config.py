@@ -16,7 +16,7 @@ from lerobot_playbyear.datasets.files import parse_json
 OWN_CONFIG_NAME = "playbyear_train_config.json"
 """File beside `train_config.json` that holds the options which lerobot-train does not know."""
 
-_OWN_FIELDS = ("preset", "store", "compile")
+_OWN_FIELDS = ("preset", "store", "compile", "steps_per_episode")
 
 
 @dataclass
@@ -37,7 +37,7 @@ class StoreConfig:
 
 @dataclass
 class PlaybyearTrainConfig(TrainPipelineConfig):
-    """All options of lerobot-train, and `--preset`, `--store.*` and `--compile`.
+    """All options of lerobot-train, and `--preset`, `--store.*`, `--compile` and `--steps_per_episode`.
 
     A checkpoint keeps lerobot-train's options in its `train_config.json` and the others in a file of their own, so
     that lerobot-train can resume what playbyear-train began, and the other way round.
@@ -46,11 +46,14 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         preset: A named set of defaults: `cpu`, `gpu` or `paper`.
         store: Where the dataset is kept. `--store=disk` is short for `--store.place=disk`.
         compile: Compile the encoders and the head with torch, which takes half a minute. Meant for GPUs.
+        steps_per_episode: Raises `steps` to this many for each learned episode, for more demonstrations help only with more
+            updates. A checkpoint holds the raised `steps`.
     """
 
     preset: str | None = None
     store: StoreConfig = field(default_factory=StoreConfig)
     compile: bool = False
+    steps_per_episode: int = 0
 
     def validate(self) -> None:
         """As for lerobot-train; options that need its data loader are refused.

@@ -62,6 +62,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
             dataset, held_out = make_train_eval_datasets(cfg)
         reader = DatasetReader.of(dataset)
         cfg.policy.fps = cfg.policy.fps or reader.fps
+        cfg.steps, cfg.steps_per_episode = max(cfg.steps, cfg.steps_per_episode * dataset.num_episodes), 0
         meta = learned_meta(cfg.policy, reader.meta)
         learner = make_learner(cfg, meta, accelerator=accelerator)
         is_shared = accelerator.num_processes > 1
