@@ -343,6 +343,29 @@ def test_a_folder_that_leads_out_of_the_outputs_is_refused(tmp_path, name):
     assert not (tmp_path / "count").exists()
 
 
+@pytest.mark.parametrize(
+    ("where", "content"),
+    [
+        ("studies/parts/seeds", [1]),
+        ("studies/parts/tasks", 3),
+        ("courses/offline", ["records"]),
+        ("steps/train", "train"),
+    ],
+)
+def test_a_plan_of_another_shape_is_refused_before_anything_is_done(tmp_path, where, content):
+    path = write_plan(tmp_path)
+    plan = yaml.safe_load(path.read_text())
+    *sections, last = where.split("/")
+    part = plan
+    for section in sections:
+        part = part[section]
+    assert last in part or last == "seeds"
+    part[last] = content
+    path.write_text(yaml.safe_dump(plan))
+    with pytest.raises(InputError, match="is not built as those of the package's plan.yaml"):
+        Plan("tiny", tmp_path / "out", path)
+
+
 def test_without_submitit_a_cluster_is_refused(tmp_path):
     write_plan(tmp_path)
     (tmp_path / "submitit.py").write_text("raise ImportError('blocked')\n")

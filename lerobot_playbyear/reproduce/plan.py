@@ -195,6 +195,16 @@ class Plan:
         if twice := set(self.text["sizes"][size]) & set(self.text["steps"]):
             raise InputError(f"--plan={path}: {', '.join(sorted(twice))} is a value and a step: give it another name.")
         self.size, self.output, self.device = size, output, device
+        try:
+            for cell in self.cells if path else []:
+                _ = cell.steps, [cell.evaluation("held_out", candidate) for candidate in cell.candidates]
+        except InputError:
+            raise
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"--plan={path}: a study, variant, course or step is not built as those of the package's plan.yaml "
+                f"({type(error).__name__}: {error}). Compare it with that."
+            ) from error
 
     @cached_property
     def cells(self) -> list[Cell]:
