@@ -362,7 +362,7 @@ def test_a_plan_of_another_shape_is_refused_before_anything_is_done(tmp_path, wh
     assert last in part or last == "seeds"
     part[last] = content
     path.write_text(yaml.safe_dump(plan))
-    with pytest.raises(InputError, match="is not built as those of the package's plan.yaml"):
+    with pytest.raises(InputError, match=r"is not built as those of the package's plan.yaml"):
         Plan("tiny", tmp_path / "out", path)
 
 
