@@ -96,14 +96,13 @@ def noise() -> list[str]:
     kinds = ("speech", "hits", "music", "footsteps")
     levels = {n: [rows("two_microphones", GRASP, f"{kind}_{n}") for kind in kinds] for n in (2, 8)}
     places = ("quiet", "dull_microphones", "telephones", "boomy_microphones")
-    fainter = [
-        {name: rows("two_microphones", task, name) for name in ("quiet", *(f"{kind}_2" for kind in kinds))}
-        for task in (PLACE, "KeyBag-Easy-v1")
-    ]
-    place, bag = (
-        f"quiet {share(own['quiet'])}, at twice the background {', '.join(each(own[f'{kind}_2']) for kind in kinds)} %."
-        for own in fainter
-    )
+    others = {
+        name: [rows("two_microphones", task, place + expert) for place in ("quiet", *(f"{kind}_2" for kind in kinds))]
+        for name, task, expert in (
+            ("Pick and Place, an earlier expert", PLACE, "-earlier_expert"),
+            ("Key Bag, Easy", "KeyBag-Easy-v1", ""),
+        )
+    }
     quiet, dull, telephones, boomy = (whole(rows("two_microphones", GRASP, place)) for place in places)
     return [
         *(f"| {how} | {' | '.join(map(whole, found))} |" for how, found in trained),
@@ -111,8 +110,7 @@ def noise() -> list[str]:
         f"Deaf policies solve {share(rows('offline', GRASP, 'no_interventions-no_audio'))} whatever plays.",
         *(f"| at {n} times the background | {' | '.join(map(whole, found))} |" for n, found in levels.items()),
         *(f"| by seed | {' | '.join(map(each, found))} |" for found in levels.values()),
-        f"Pick and Place, one training: {place}",
-        f"Key Bag Easy, one training with the earlier expert: {bag}",
+        *(f"| {name} | {' | '.join(map(whole, found))} |" for name, found in others.items()),
         f"In the quiet {quiet}; dull microphones {dull}, telephones {telephones}, boomy ones {boomy}.",
         f"Steady noise at 8 and 16 times the background leaves {whole(loud[0])} and {whole(loud[1])} (",
     ]
@@ -158,8 +156,8 @@ def interventions() -> list[str]:
     parts = [f"no_interventions-no_{part}" for part in ("audio", "vision", "memory")]
     names = ("no_interventions", *parts, "equal_updates", "full", "redo", "residual_rl")
     tables = [
-        {name: rows("interventions", task, name, may_miss=True) for name in names}
-        for task in (GRASP, "OccludedPickPlace-v1")
+        {name: rows("interventions", task, name + expert, may_miss=True) for name in names}
+        for task, expert in ((GRASP, ""), (PLACE, "-earlier_expert"))
     ]
     by_name, placed = tables
     full, redo = ([row["expert"] for row in by_name[name]] for name in ("full", "redo"))

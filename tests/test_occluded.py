@@ -194,6 +194,23 @@ def test_before_it_lets_go_of_the_cube_the_expert_goes_on_where_the_policy_is(ta
     assert (gate.reason, gate.expert.phase) == ("opens", phase)
 
 
+def test_the_height_of_a_demonstrated_carry_does_not_tell_how_far_the_tray_is():
+    heights, slopes = [], []
+    for seed in range(6):
+        env = begin("OccludedPickPlace-v1", seed)
+        expert, done, way = env.scripted_expert(), False, []
+        while not done:
+            _, terminated, truncated, _ = env.step_physics(expert.act())
+            done = terminated or truncated
+            if expert.phase == "carry":
+                way.append((env.eef_position - env.position("bin"))[1:])
+        rest, height = np.array(way[5:]).T  # the first steps end the lift
+        heights.append(height.mean())
+        slopes.append(np.polyfit(rest, height, 1)[0] * np.ptp(rest))
+    assert np.std(heights) > 0.004
+    assert np.abs(np.mean(slopes)) < 0.25 * np.ptp(heights), "how much it sinks on the way"
+
+
 def carried(drift, n_steps=60, **options):
     """Pick and Place, version 1: a policy that carries the cube, moves by `drift` on the way, and the gate that watches."""
     env, gate = at_phase("OccludedPickPlace-v1", "carry", **options)

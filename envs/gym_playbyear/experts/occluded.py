@@ -202,13 +202,22 @@ class GraspExpert(Script):
 
 
 class PickPlaceExpert(GraspExpert):
-    """Grasps the hidden cube by touch, carries it to the tray and lets go."""
+    """Grasps the hidden cube by touch, carries it to the tray and lets go.
 
-    carry_height = 0.10  # m above the table
+    It carries level, at a height that is drawn for each attempt: if the hand sank on the way, its height would tell a policy
+    when the tray is near.
+    """
+
+    CARRY_HEIGHT = (0.103, 0.128)  # m above the table
+    carry_height = CARRY_HEIGHT[0]
     release_height = 0.075
 
+    def _draw_habits(self) -> None:
+        super()._draw_habits()
+        self.carry_height = self.rng.uniform(*self.CARRY_HEIGHT)
+
     def _lift(self):
-        if self.env.eef_position[2] > TABLE_TOP + self.carry_height - 0.01:
+        if self.env.eef_position[2] > TABLE_TOP + self.carry_height - 0.005:
             self.phase = "carry"
         return np.array([0, 0, self.rise_step]), True
 
@@ -223,10 +232,11 @@ class PickPlaceExpert(GraspExpert):
         return self._towards(goal, self.BRING_BACK_STEP), True
 
     def _carry(self):
-        goal = self.env.shown["bin_position"] + np.array([0, 0, self.carry_height])
-        if np.abs(goal - self.env.eef_position)[:2].max() < 0.006:
+        rest = self.env.shown["bin_position"] + np.array([0, 0, self.carry_height]) - self.env.eef_position
+        if np.abs(rest)[:2].max() < 0.006:
             self.phase = "release"
-        return self._towards(goal), True
+        level = self._towards(self.env.eef_position + rest * [1, 1, 0])
+        return level + np.array([0, 0, np.clip(self.GAIN * rest[2], -0.015, 0.015)]), True
 
     def _release(self):
         goal = self.env.shown["bin_position"] + np.array([0, 0, self.release_height])

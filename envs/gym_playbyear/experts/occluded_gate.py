@@ -38,11 +38,8 @@ STRAY_X, STRAY_Y = 0.03, 0.12  # how far a hand that searches may be beside the 
 HOP_PAST = 0.03  # how far a hand that rose after the touch may go past the cube
 MEMORY_STEPS = 40  # how long the policy hears a touch; what it does then is judged by its result
 SEARCH_STEP, TRAVEL_STEP = 0.0085, 0.016  # what the expert covers per step in the sweep and elsewhere, for what follows
-GRASP_STEPS, LIFT_STEPS, PLACE_STEPS = (
-    25,
-    5,
-    30,
-)  # what it needs from the touch until the fingers hold, to lift, to release
+# What it needs from the touch until the fingers hold, to lift, to release.
+GRASP_STEPS, LIFT_STEPS, PLACE_STEPS = 25, 5, 30
 SLACK_STEPS = 3  # it takes over when it has only so many steps more than it needs
 
 SEARCH, GRASP, LIFT, CARRY = range(4)
@@ -120,8 +117,8 @@ class InterventionGate(StagedGate):
         return tray is not None and bool(np.abs(self.env.position("cube") - tray)[:2].max() < RELEASE_REACH)
 
     def _carry_height(self) -> float:
-        """At which the expert carries [m above the table]; infinite where nothing is carried."""
-        return getattr(self.expert, "carry_height", np.inf)
+        """The lowest at which the expert carries [m above the table]; infinite where nothing is carried."""
+        return getattr(self.expert, "CARRY_HEIGHT", (np.inf,))[0]
 
     def _before_cube(self) -> bool:
         """Whether a sweep from here can still touch the cube."""
