@@ -36,12 +36,14 @@ def run_in_process(main: Callable[[], Any], *arguments: str | Path) -> Any:
     """Run a command in this process. Returns what `main` returns, or the exit status or message that it ended with."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["command", *map(str, arguments)])
+        if state := sys.modules.get("accelerate.state"):  # what a process computes in is decided once in it
+            state.AcceleratorState._reset_state()
         try:
             return main()
         except SystemExit as end:
             return end.code
         finally:
-            if state := sys.modules.get("accelerate.state"):  # what a process computes in is decided once in it
+            if state := sys.modules.get("accelerate.state"):
                 state.AcceleratorState._reset_state()
 
 
