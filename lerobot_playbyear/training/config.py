@@ -46,8 +46,8 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         preset: A named set of defaults: `cpu`, `gpu` or `paper`.
         store: Where the dataset is kept. `--store=disk` is short for `--store.place=disk`.
         compile: Compile the encoders and the head with torch, which takes half a minute. Meant for GPUs.
-        steps_per_episode: Raises `steps` to this many for each learned episode, for more demonstrations help only with more
-            updates. A checkpoint holds the raised `steps`.
+        steps_per_episode: Raises `steps` to this many for each learned episode. 0 leaves them as they are, and `--preset=cpu`
+            does where `--steps` is given. A checkpoint holds the raised `steps`.
     """
 
     preset: str | None = None
