@@ -28,6 +28,8 @@ _MOST_TASKS = 5
 _LONGEST_S = 30
 _PICTURE_HEIGHT = 336  # pixels, at most
 _BLANK = np.zeros((2, 480, 3), np.uint8)  # above the spectrogram of a dataset without cameras
+# With x264's mbtree the same film differs from run to run, and would be sent again.
+_REPEATABLE = {"x264-params": "mbtree=0"}
 
 _LISTEN = """```python
 from lerobot.datasets import LeRobotDataset
@@ -167,7 +169,8 @@ def film_preview(dataset: SurveyedDataset, path: Path) -> str:
     sound, sample_rate = film_sound([heard(dataset, key, shown) for key in microphones[:2]], n_frames, dataset.fps)
     streams = {camera: dataset.pictures(camera, shown) for camera in dataset.cameras}
     pictures = tile(streams, n_frames, _PICTURE_HEIGHT)[1] if streams else itertools.repeat(_BLANK, n_frames)
-    write_film(path, compose(pictures, n_frames, sound, sample_rate), dataset.fps, sound, sample_rate)
+    film = compose(pictures, n_frames, sound, sample_rate)
+    write_film(path, film, dataset.fps, sound, sample_rate, _REPEATABLE)
     part = "Episode" if n_frames == len(episode) else "The beginning of episode"
     names = [code(key.rsplit(".", 1)[-1]) for key in microphones[: sound.shape[1]]]
     sides = f"{names[0]} (left) and {names[1]} (right)" if len(names) == 2 else "".join(names)
