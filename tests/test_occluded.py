@@ -185,30 +185,35 @@ def at_phase(task: str, phase: str, seed: int = 1, **options):
 def test_before_it_lets_go_of_the_cube_the_expert_goes_on_where_the_policy_is(task, phase, patient):
     env, gate = at_phase(task, phase, horizon=350)
     hold, let_go = np.array([0, 0, 0, 1.0]), np.array([0, 0, 0, -1.0])
-    assert not env.gripper_obeys
+    assert env.gripper_blocked_steps
     assert not gate.wants_control(let_go)  # nothing happens yet: the fingers have just closed
-    while not env.gripper_obeys:
+    while env.gripper_blocked_steps:
         env.step_physics(hold)
         assert not gate.wants_control(hold)
     assert gate.wants_control(let_go)
     assert (gate.reason, gate.expert.phase) == ("opens", phase)
 
 
-def test_the_height_of_a_demonstrated_carry_does_not_tell_how_far_the_tray_is():
-    heights, slopes = [], []
+def test_a_demonstrated_carry_neither_sinks_on_the_way_nor_waits_above_the_tray():
+    heights, slopes, waits = [], [], []
     for seed in range(6):
         env = begin("OccludedPickPlace-v1", seed)
-        expert, done, way = env.scripted_expert(), False, []
+        expert, done, way, ignored = env.scripted_expert(), False, [], []
         while not done:
-            _, terminated, truncated, _ = env.step_physics(expert.act())
+            action = expert.act()
+            if expert.phase == "release" and action[3] < 0:
+                ignored.append(env.gripper_blocked_steps > 0)
+            _, terminated, truncated, _ = env.step_physics(action)
             done = terminated or truncated
             if expert.phase == "carry":
                 way.append((env.eef_position - env.position("bin"))[1:])
         rest, height = np.array(way[5:]).T  # the first steps end the lift
         heights.append(height.mean())
         slopes.append(np.polyfit(rest, height, 1)[0] * np.ptp(rest))
+        waits.append(ignored.index(False))
     assert np.std(heights) > 0.004
     assert np.abs(np.mean(slopes)) < 0.25 * np.ptp(heights), "how much it sinks on the way"
+    assert max(waits) <= 1, "steps in which it is told to open and may not"
 
 
 def carried(drift, n_steps=60, **options):

@@ -43,7 +43,7 @@ class TaskEnv(gym.Env):
     would and independently of it; what it renders with it opens itself, when it first draws.
 
     Experts, gates, tests and whoever judges may read the true state, which a policy may not: `position`, `eef_position`,
-    `finger_positions`, `gripper_obeys`, `contact_forces`, `hand_forces`, `is_as_wanted`, and the attributes below.
+    `finger_positions`, `gripper_blocked_steps`, `contact_forces`, `hand_forces`, `is_as_wanted`, and the attributes below.
 
     Args:
         task: A task's name, a task, or a function that makes one of `task_options`.
@@ -415,9 +415,9 @@ class TaskEnv(gym.Env):
         return np.concatenate([hand, self.data.qpos[self._fingers], self.data.qvel[self._fingers]])
 
     @property
-    def gripper_obeys(self) -> bool:
-        """Whether a change of the gripper's command takes effect in the next step; for 2 s after the last one it does not."""
-        return self._controller.gripper_obeys
+    def gripper_blocked_steps(self) -> int:
+        """For how many more steps a change of the gripper's command is ignored: at first the 2 s after the last change."""
+        return self._controller.gripper_blocked_steps
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:

@@ -243,9 +243,9 @@ class CartesianController:
         return controls
 
     @property
-    def gripper_obeys(self) -> bool:
-        """Whether a change of the gripper's command takes effect in the next step."""
-        return self._steps_since_change >= self._cooldown_steps
+    def gripper_blocked_steps(self) -> int:
+        """For how many more steps a change of the gripper's command is ignored."""
+        return max(self._cooldown_steps - self._steps_since_change, 0)
 
     def _update_gripper(self, close: bool) -> None:
         self._steps_since_change += 1

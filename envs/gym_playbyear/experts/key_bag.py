@@ -278,7 +278,7 @@ class BagGate(StagedGate):
         left, forces = self.env._max_episode_steps - self._n_steps, self.env.contact_forces
         touched = None if self._touched_at is None else self._n_steps - self._touched_at
         if self._holds():
-            opens = action[3] <= 0 and self.env.gripper_obeys
+            opens = action[3] <= 0 and not self.env.gripper_blocked_steps
             return "opens" if opens else "still" if self._is_still() else None
         pressed = max(forces[f"gripper-{CONTENTS}"], forces[f"gripper-{BAG}"]) > PUSH_FORCE
         checks = {

@@ -105,9 +105,8 @@ class GraspExpert(Script):
     def _lower(self):
         goal = self._on_line(self.sweep_start, self.sweep_height)
         if self._near(goal, self.TOLERANCE):
-            self.phase = "sweep"
             self._wait = int(self.rng.integers(*self.PAUSE))
-        return self._towards(goal), False
+        return self._go(goal, self.TOLERANCE, "sweep")
 
     def _sweep(self):
         eef = self.env.eef_position
@@ -121,8 +120,7 @@ class GraspExpert(Script):
         if self._wait == 0 and self.rng.random() < self.PAUSE_PROBABILITY:
             self._wait = int(self.rng.integers(*self.PAUSE, endpoint=True))
         step = self.sweep_step if self._has_waited() else 0.0
-        hold = self._on_line(eef[1], self.sweep_height)
-        return self._towards(hold) + np.array([0, step, 0]), False
+        return self._towards(self._on_line(eef[1], self.sweep_height)) + np.array([0, step, 0]), False
 
     def _feels_contact(self) -> bool:
         return self.env.contact_forces["gripper-cube"] > self.CONTACT_FORCE
@@ -205,16 +203,18 @@ class PickPlaceExpert(GraspExpert):
     """Grasps the hidden cube by touch, carries it to the tray and lets go.
 
     It carries level, at a height that is drawn for each attempt: if the hand sank on the way, its height would tell a policy
-    when the tray is near.
+    when the tray is near. And it carries so slowly over a short way that it need not wait above the tray until the fingers obey
+    again: in what a policy sees, such a wait is like a pause of the sweep.
     """
 
     CARRY_HEIGHT = (0.103, 0.128)  # m above the table
-    carry_height = CARRY_HEIGHT[0]
-    release_height = 0.075
+    CARRY_SLACK = (-2, 4)  # steps from when the fingers obey until it is above the tray, at least; then it comes down
+    RELEASE_HEIGHT = 0.075
+    carry_height, carry_step = CARRY_HEIGHT[0], 0.0
 
     def _draw_habits(self) -> None:
         super()._draw_habits()
-        self.carry_height = self.rng.uniform(*self.CARRY_HEIGHT)
+        self.carry_height, self.carry_step = self.rng.uniform(*self.CARRY_HEIGHT), 0.0
 
     def _lift(self):
         if self.env.eef_position[2] > TABLE_TOP + self.carry_height - 0.005:
@@ -235,10 +235,11 @@ class PickPlaceExpert(GraspExpert):
         rest = self.env.shown["bin_position"] + np.array([0, 0, self.carry_height]) - self.env.eef_position
         if np.abs(rest)[:2].max() < 0.006:
             self.phase = "release"
-        level = self._towards(self.env.eef_position + rest * [1, 1, 0])
+        n_steps = max(self.env.gripper_blocked_steps + self.rng.uniform(*self.CARRY_SLACK), 1)
+        self.carry_step = self.carry_step or min(float(np.hypot(*rest[:2])) / n_steps, self.MAX_STEP)
+        level = self._towards(self.env.eef_position + rest * [1, 1, 0], self.carry_step)
         return level + np.array([0, 0, np.clip(self.GAIN * rest[2], -0.015, 0.015)]), True
 
     def _release(self):
-        goal = self.env.shown["bin_position"] + np.array([0, 0, self.release_height])
-        low = self.env.eef_position[2] < goal[2] + 0.006
-        return self._towards(goal), not low
+        goal = self.env.shown["bin_position"] + np.array([0, 0, self.RELEASE_HEIGHT])
+        return self._towards(goal), self.env.eef_position[2] > goal[2] + 0.006

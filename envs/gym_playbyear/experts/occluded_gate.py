@@ -136,7 +136,7 @@ class InterventionGate(StagedGate):
             "landed": self._on_top_for > LANDED_STEPS,
             "empty": not holds and self.env.finger_positions.sum() < EMPTY_OPENING,
             "misplaces": holds and self._misplaces(),
-            "opens": holds and action[3] <= 0 and self.env.gripper_obeys,
+            "opens": holds and action[3] <= 0 and not self.env.gripper_blocked_steps,
             "dropped": not holds and self._was_held and np.linalg.norm(self._offset()) > DROP_DISTANCE,
             "missed": not holds and not self._was_held and self._missed(),
             "strayed": not holds and self._strayed(),

@@ -55,7 +55,7 @@ class PouchExpert(Script):
 
     def _approach(self):
         goal = self._over_pouch(self.hover_height)
-        if self._near(goal, 2 * self.TOLERANCE) and self.env.gripper_obeys:
+        if self._near(goal, 2 * self.TOLERANCE) and not self.env.gripper_blocked_steps:
             self.phase = "lower"
         return self._towards(goal), False
 
@@ -83,7 +83,7 @@ class PouchExpert(Script):
 
     def _carry(self):
         """Up there, until the fingers obey again, and a little longer."""
-        if self.env.gripper_obeys and self._has_waited():
+        if not self.env.gripper_blocked_steps and self._has_waited():
             self.phase = "drop"
             return np.zeros(3), False
         return np.zeros(3), True
