@@ -194,8 +194,8 @@ def test_before_it_lets_go_of_the_cube_the_expert_goes_on_where_the_policy_is(ta
     assert (gate.reason, gate.expert.phase) == ("opens", phase)
 
 
-def test_a_demonstrated_carry_neither_sinks_on_the_way_nor_waits_above_the_tray():
-    heights, slopes, waits = [], [], []
+def test_a_demonstrated_carry_tells_neither_by_height_nor_by_time_where_the_tray_is_and_does_not_wait_there():
+    heights, slopes, waits, lengths = [], [], [], []
     for seed in range(6):
         env = begin("OccludedPickPlace-v1", seed)
         expert, done, way, ignored = env.scripted_expert(), False, [], []
@@ -211,8 +211,10 @@ def test_a_demonstrated_carry_neither_sinks_on_the_way_nor_waits_above_the_tray(
         heights.append(height.mean())
         slopes.append(np.polyfit(rest, height, 1)[0] * np.ptp(rest))
         waits.append(ignored.index(False))
+        lengths.append(len(way))
     assert np.std(heights) > 0.004
     assert np.abs(np.mean(slopes)) < 0.25 * np.ptp(heights), "how much it sinks on the way"
+    assert np.std(lengths) > 4, "steps of a carry"
     assert max(waits) <= 1, "steps in which it is told to open and may not"
 
 
