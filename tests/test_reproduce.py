@@ -71,7 +71,8 @@ def test_killed_at_any_moment_it_goes_on(tmp_path):
         process.wait()
     assert call(tmp_path, "run", "--jobs=2").returncode == 0
     assert len(rows(tmp_path)) == N_CELLS
-    assert max(Counter(counted(tmp_path)).values()) <= 2, "what was noted as done is not done again"
+    # Between what a step did and the note of it there are milliseconds, which two of the kills may hit.
+    assert max(Counter(counted(tmp_path)).values()) <= 3, "what was noted as done is not done again"
 
 
 def write_json(path: Path, **content: int) -> None:
