@@ -72,7 +72,7 @@ def test_a_run_collects_learns_saves_and_evaluates(finished):
         assert line["loss_demonstrations"] > 0
         assert line["loss_interventions"] > 0
         parts = ["simulation", "inference", "update", "batch", "loss", "episode_saving", "checkpoint_saving"]
-        assert line["total_s"] == pytest.approx(sum(line[f"{part}_s"] for part in parts), rel=0.2, abs=0.25)
+        assert line["total_s"] == pytest.approx(sum(line[f"{part}_s"] for part in parts), rel=0.2)
     assert {path.name for path in (finished / "out/checkpoints").iterdir()} == {"000002", "000004", "last", "best"}
     assert {(finished / "out/checkpoints" / name).resolve().name for name in ("last", "best")} == {"000004"}
     check_normalisation_is_kept(finished / "out/checkpoints/last/pretrained_model")

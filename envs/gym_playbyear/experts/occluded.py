@@ -203,13 +203,13 @@ class PickPlaceExpert(GraspExpert):
     """Grasps the hidden cube by touch, carries it to the tray and lets go.
 
     It carries level, at a height and for a time that are drawn for each attempt: if the hand sank on the way, or always came
-    as long after the fingers closed, that would tell a policy when to let go, and not the place. It never comes before the
-    fingers obey again: in what a policy sees, a wait above the tray is like a pause of the sweep.
+    as long after the fingers closed, that would tell a policy when to let go, and not the place. It comes down when the fingers
+    obey again: in what a policy sees, a wait above the tray is like a pause of the sweep.
     """
 
     CARRY_HEIGHT = (0.103, 0.128)  # m above the table
     CARRY_SLACK = (-2, 20)  # steps from when the fingers obey until it is above the tray, at least; then it comes down
-    RELEASE_HEIGHT = 0.075
+    RELEASE_HEIGHT = 0.075  # m above the table
     carry_height, carry_step = CARRY_HEIGHT[0], 0.0
 
     def _draw_habits(self) -> None:
